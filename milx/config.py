@@ -1,0 +1,261 @@
+"""Every hyperparameter, as plain dataclasses, and the presets that fill them.
+
+`make_config("reach", preset="paper")` gives a complete configuration; a launcher's `--config.path.to.field=value`
+overrides one field of it.
+"""
+
+import dataclasses
+import typing
+from collections.abc import Callable
+from typing import Any
+
+
+@dataclasses.dataclass
+class EnvConfig:
+    """The world.
+
+    Attributes:
+        image_shape: (H, W) of the policy's image in pixels.
+    """
+
+    image_shape: tuple[int, int] = (64, 80)
+
+
+@dataclasses.dataclass
+class DataConfig:
+    """Expert demonstrations.
+
+    Attributes:
+        tasks: training tasks.
+        demos_per_task: demonstrations of each, in different scenes.
+        noise: standard deviation of the Gaussian noise on the expert's actions, in units of the action.
+        plan_iterations: most iterations of trajectory optimisation for a demonstration.
+        plan_batch: demonstrations planned at once.
+    """
+
+    tasks: int = 1500
+    demos_per_task: int = 10
+    noise: float = 0.02
+    plan_iterations: int = 12
+    plan_batch: int = 4096
+
+
+@dataclasses.dataclass
+class NetworkConfig:
+    """The policy network.
+
+    Attributes:
+        filters: output channels of each convolution.
+        strides: stride of each convolution.
+        kernel: height and width of every kernel.
+        soft_argmax: spatial soft-argmax after the last convolution; flattened otherwise.
+        fc_layers: sizes of the hidden fully connected layers.
+        fc_norm: layer norm in the hidden fully connected layers.
+        fc_init_std: standard deviation of their first weights; None for LeCun's initialisation.
+        bias_transformation: size of the learned vector beside the first fully connected layer's input; 0 for none.
+        heads: 1, or 2 for a separate output layer in the inner loss.
+        goal_head: predict where the episode ends, from the image, and show the prediction to the layers after it.
+    """
+
+    filters: tuple[int, ...] = (40, 40, 40)
+    strides: tuple[int, ...] = (2, 2, 2)
+    kernel: int = 3
+    soft_argmax: bool = False
+    fc_layers: tuple[int, ...] = (200, 200, 200, 200)
+    fc_norm: bool = True
+    fc_init_std: float | None = None
+    bias_transformation: int = 10
+    heads: int = 1
+    goal_head: bool = False
+
+
+@dataclasses.dataclass
+class MILConfig:
+    """Meta-imitation learning (paper, Section 4).
+
+    Attributes:
+        inner_steps: gradient steps of an adaptation.
+        inner_lr: their learning rate alpha.
+        learn_inner_lr: meta-learn a factor on alpha for every tensor.
+        inner_clip: bound on each entry of the inner gradient.
+        first_order: do not differentiate through the inner gradient.
+        loss_scale: m; errors of the actions are multiplied by it before they are squared.
+        whiten_actions: let the network predict actions with zero mean and unit variance.
+        goal_weight: weight of the goal head's squared error in both losses.
+    """
+
+    inner_steps: int = 1
+    inner_lr: float = 1e-3
+    learn_inner_lr: bool = False
+    inner_clip: float = 20.0
+    first_order: bool = False
+    loss_scale: float = 1.0
+    whiten_actions: bool = False
+    goal_weight: float = 0.0
+
+
+@dataclasses.dataclass
+class OptimizerConfig:
+    """Adam on the meta-objective.
+
+    Attributes:
+        learning_rate: its peak.
+        warmup: part of the run that warms up linearly from zero.
+        cosine: decay to zero along a cosine over the run; constant otherwise.
+        clip_norm: bound on the global norm of the meta-gradient; None for none.
+    """
+
+    learning_rate: float = 1e-3
+    warmup: float = 0.0
+    cosine: bool = False
+    clip_norm: float | None = None
+
+
+@dataclasses.dataclass
+class TrainConfig:
+    """The meta-training loop.
+
+    Attributes:
+        steps: meta-updates.
+        meta_batch: tasks in a meta-batch.
+        shots: support demonstrations of each task.
+        support_frames: time steps drawn from each support demonstration; None for all.
+        query_frames: time steps drawn from each query demonstration; None for all.
+        log_every: meta-updates in one scan on the device.
+        eval_every: meta-updates between two validations; each is followed by a checkpoint.
+    """
+
+    steps: int = 30_000
+    meta_batch: int = 5
+    shots: int = 1
+    support_frames: int | None = None
+    query_frames: int | None = None
+    log_every: int = 100
+    eval_every: int = 2000
+
+
+@dataclasses.dataclass
+class EvalConfig:
+    """Closed-loop evaluation.
+
+    Attributes:
+        validation_tasks: held-out tasks for choosing the best checkpoint.
+        tasks: held-out tasks of the reported number.
+        trials: scenes tried for each task.
+        shots: demonstrations that the policy adapts to.
+        batch: tasks rolled out at once.
+    """
+
+    validation_tasks: int = 100
+    tasks: int = 150
+    trials: int = 10
+    shots: int = 1
+    batch: int = 150
+
+
+@dataclasses.dataclass
+class Config:
+    """A whole run."""
+
+    env_name: str = "reach"
+    method_name: str = "mil"
+    preset: str = "paper"
+    seed: int = 0
+    env: EnvConfig = dataclasses.field(default_factory=EnvConfig)
+    data: DataConfig = dataclasses.field(default_factory=DataConfig)
+    network: NetworkConfig = dataclasses.field(default_factory=NetworkConfig)
+    mil: MILConfig = dataclasses.field(default_factory=MILConfig)
+    optimizer: OptimizerConfig = dataclasses.field(default_factory=OptimizerConfig)
+    train: TrainConfig = dataclasses.field(default_factory=TrainConfig)
+    evaluation: EvalConfig = dataclasses.field(default_factory=EvalConfig)
+
+
+def _reach_paper() -> Config:
+    return Config(
+        network=NetworkConfig(fc_init_std=0.01),
+        mil=MILConfig(loss_scale=100.0),
+    )
+
+
+def _reach_fast() -> Config:
+    return Config(
+        network=NetworkConfig(strides=(2, 2, 1), soft_argmax=True, fc_layers=(200, 200), goal_head=True),
+        mil=MILConfig(inner_lr=0.03, learn_inner_lr=True, whiten_actions=True, goal_weight=1.0),
+        optimizer=OptimizerConfig(warmup=0.05, cosine=True, clip_norm=1.0),
+        train=TrainConfig(steps=8000, meta_batch=16, support_frames=25, query_frames=25),
+    )
+
+
+def _reach_cpu() -> Config:
+    config = _reach_fast()
+    config.env = EnvConfig(image_shape=(32, 40))
+    config.data = DataConfig(tasks=400, demos_per_task=6, plan_batch=400)
+    config.network.filters = (24, 24, 24)
+    config.network.strides = (2, 1, 1)
+    config.network.fc_layers = (100, 100)
+    config.train = TrainConfig(steps=5000, meta_batch=8, support_frames=10, query_frames=10, eval_every=1000)
+    config.evaluation.validation_tasks = 50
+    config.evaluation.batch = 25
+    return config
+
+
+PRESETS: dict[str, dict[str, Callable[[], Config]]] = {
+    "reach": {"paper": _reach_paper, "fast": _reach_fast, "cpu": _reach_cpu},
+}
+"""Preset factories by environment and name."""
+
+
+def make_config(env: str, method: str = "mil", preset: str = "fast", seed: int = 0) -> Config:
+    """The configuration of a preset.
+
+    Raises:
+        ValueError: for an environment or preset that does not exist; the message lists those that do.
+    """
+    if env not in PRESETS:
+        raise ValueError(f"env: got {env!r}, expected one of {', '.join(PRESETS)}")
+    if preset not in PRESETS[env]:
+        raise ValueError(f"preset: got {preset!r}, expected one of {', '.join(PRESETS[env])}")
+    config = PRESETS[env][preset]()
+    config.env_name, config.method_name, config.preset, config.seed = env, method, preset, seed
+    return config
+
+
+def to_dict(config: Config) -> dict[str, Any]:
+    """The configuration as nested dictionaries that JSON can hold."""
+    return dataclasses.asdict(config)
+
+
+def from_dict(values: dict[str, Any]) -> Config:
+    """The inverse of `to_dict`, also after a trip through JSON.
+
+    Raises:
+        ValueError: for a field that does not exist; the message lists those that do.
+    """
+    return _build(Config, values, "config")
+
+
+def flatten(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested dictionaries as one, with dotted names."""
+    flat = {}
+    for name, value in values.items():
+        flat |= flatten(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
+    return flat
+
+
+def differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
+    """Where two configurations of `to_dict` differ, a line each."""
+    before, after = flatten(old), flatten(new)
+    return [f"{name} was {before[name]}, now {after[name]}" for name in before if before[name] != after[name]]
+
+
+def _build(cls: type, values: dict[str, Any], path: str) -> Any:
+    types = typing.get_type_hints(cls)
+    unknown = sorted(set(values) - set(types))
+    if unknown:
+        raise ValueError(f"{path}.{unknown[0]}: no such field, expected one of {', '.join(types)}")
+    built = {}
+    for name, value in values.items():
+        if dataclasses.is_dataclass(types[name]):
+            value = _build(typing.cast(type, types[name]), value, f"{path}.{name}")
+        built[name] = tuple(value) if isinstance(value, list) else value
+    return cls(**built)

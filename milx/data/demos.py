@@ -1,0 +1,209 @@
+"""Simulated demonstrations: states, actions and tasks on the device; pixels are rendered when they are needed."""
+
+import dataclasses
+import hashlib
+import pathlib
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from milx.chunks import map_in_chunks
+from milx.envs.base import Env, State, Task
+from milx.trajopt.expert import perform
+from milx.trajopt.ilqr import Options
+from milx.types import Demo, TaskBatch
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class DemoSet:
+    """D demonstrations of each of N tasks.
+
+    Attributes:
+        task: the tasks, with a leading axis [N].
+        states: with leading axes [N, D, T + 1].
+        action: [N, D, T, A].
+        success: [N, D] bool, whether the expert reached the goal.
+    """
+
+    task: Task
+    states: State
+    action: jax.Array
+    success: jax.Array
+
+    @property
+    def num_tasks(self) -> int:
+        """N."""
+        return self.action.shape[0]
+
+    @property
+    def num_demos(self) -> int:
+        """D."""
+        return self.action.shape[1]
+
+
+def collect(
+    env: Env, key: jax.Array, split: str, num_tasks: int, num_demos: int, noise: float, options: Options, batch: int
+) -> DemoSet:
+    """Draws tasks of a split and plans demonstrations of each in scenes of their own.
+
+    Args:
+        env: the environment.
+        key: the set is a function of this key.
+        split: "train", "validation" or "test".
+        num_tasks: N.
+        num_demos: D.
+        noise: standard deviation of the noise on the expert's actions, in the action's units.
+        options: of the trajectory optimisation.
+        batch: demonstrations planned at once.
+    """
+    task_key, scene_key, noise_key = jax.random.split(key, 3)
+    total = num_tasks * num_demos
+    tasks = jax.vmap(env.sample_task, in_axes=(0, None))(jax.random.split(task_key, num_tasks), split)
+    each = jax.tree.map(lambda x: jnp.repeat(x, num_demos, axis=0), tasks)
+    state = jax.vmap(env.reset)(jax.random.split(scene_key, total), each)
+    inputs = (each, state, jax.random.split(noise_key, total))
+
+    states, action = map_in_chunks(lambda *chunk: perform(env, *chunk, options, noise), inputs, batch)
+    success = jax.jit(jax.vmap(env.success))(each, states)
+    states, action, success = jax.tree.map(
+        lambda x: x.reshape(num_tasks, num_demos, *x.shape[1:]), (states, action, success)
+    )
+    return DemoSet(tasks, states, action, success)
+
+
+def frame_indices(key: jax.Array, length: int, count: int | None) -> jax.Array:
+    """Draws `count` increasing time steps below `length`, one from each of equal parts, the last step always.
+
+    None draws all of them.
+    """
+    if count is None or count >= length:
+        return jnp.arange(length)
+    width = (length - 1) / (count - 1)
+    offset = jax.random.uniform(key, (count - 1,))
+    index = jnp.floor((jnp.arange(count - 1) + offset) * width).astype(jnp.int32)
+    return jnp.append(jnp.minimum(index, length - 2), length - 1)
+
+
+def render_demo(env: Env, task: Task, states: State, action: jax.Array, index: jax.Array | None = None) -> Demo:
+    """Observes one demonstration: states with a leading axis T + 1, actions [T, A].
+
+    Args:
+        env: the environment.
+        task: what the demonstration shows.
+        states: visited states.
+        action: actions taken.
+        index: [F] time steps to keep; all T if None.
+    """
+    index = jnp.arange(len(action)) if index is None else index
+    seen = jax.vmap(env.observe, in_axes=(None, 0))(task, jax.tree.map(lambda x: x[index], states))
+    return Demo(image=seen.image, state=seen.state, action=action[index])
+
+
+def sample_batch(
+    env: Env,
+    demos: DemoSet,
+    key: jax.Array,
+    *,
+    meta_batch: int,
+    shots: int,
+    support_frames: int | None = None,
+    query_frames: int | None = None,
+) -> TaskBatch:
+    """Draws tasks and different demonstrations of each, and renders them.
+
+    Args:
+        env: the environment that renders.
+        demos: where to draw from.
+        key: the batch is a function of this key.
+        meta_batch: N, tasks, drawn with replacement.
+        shots: K, support demonstrations; one more of the same task becomes the query.
+        support_frames: time steps drawn from each support demonstration; None for all.
+        query_frames: time steps drawn from the query demonstration; None for all.
+    """
+
+    def sample_task(key: jax.Array) -> TaskBatch:
+        task_key, demo_key, support_key, query_key = jax.random.split(key, 4)
+        n = jax.random.randint(task_key, (), 0, demos.num_tasks)
+        chosen = jax.random.choice(demo_key, demos.num_demos, (shots + 1,), replace=False)
+        task = jax.tree.map(lambda x: x[n], demos.task)
+
+        def load(d: jax.Array, key: jax.Array, frames: int | None) -> Demo:
+            states, action = jax.tree.map(lambda x: x[n, d], (demos.states, demos.action))
+            return render_demo(env, task, states, action, frame_indices(key, action.shape[0], frames))
+
+        support = [load(chosen[k], jax.random.fold_in(support_key, k), support_frames) for k in range(shots)]
+        query = load(chosen[shots], query_key, query_frames)
+        return TaskBatch(
+            support=jax.tree.map(lambda *xs: jnp.stack(xs), *support), query=jax.tree.map(lambda x: x[None], query)
+        )
+
+    return jax.vmap(sample_task)(jax.random.split(key, meta_batch))
+
+
+def shapes(env: Env, num_tasks: int, num_demos: int) -> DemoSet:
+    """Shapes and types of a set of D = `num_demos` demonstrations of each of N = `num_tasks` tasks."""
+
+    def expand(tree: Any, *axes: int) -> Any:
+        return jax.tree.map(lambda x: jax.ShapeDtypeStruct((*axes, *x.shape), x.dtype), tree)
+
+    key = jax.random.key(0)
+    task = jax.eval_shape(lambda key: env.sample_task(key, "train"), key)
+    state = jax.eval_shape(env.reset, key, task)
+    action, success = jax.ShapeDtypeStruct((env.action_size,), jnp.float32), jax.ShapeDtypeStruct((), jnp.bool_)
+    return DemoSet(
+        expand(task, num_tasks),
+        expand(state, num_tasks, num_demos, env.horizon + 1),
+        expand(action, num_tasks, num_demos, env.horizon),
+        expand(success, num_tasks, num_demos),
+    )
+
+
+def leaves(demos: DemoSet) -> dict[str, Any]:
+    """All arrays by name, such as "states.qpos", in a fixed order."""
+    pairs, _ = jax.tree_util.tree_flatten_with_path(demos)
+    return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in pairs}
+
+
+def fingerprint(demos: DemoSet) -> str:
+    """SHA-256 over names, types, shapes and contents of all arrays."""
+    digest = hashlib.sha256()
+    for name, leaf in leaves(demos).items():
+        array = np.ascontiguousarray(leaf)
+        digest.update(f"{name} {array.dtype} {array.shape} ".encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()
+
+
+def save(path: pathlib.Path, demos: DemoSet) -> None:
+    """Writes a set as one .npz file; a file of that name is replaced only once the new one is complete."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_suffix(".partial.npz")
+    np.savez_compressed(partial, **{name: np.asarray(leaf) for name, leaf in leaves(demos).items()})
+    partial.replace(path)
+
+
+def load(path: pathlib.Path, like: DemoSet) -> DemoSet:
+    """Reads a set written by `save`.
+
+    Args:
+        path: the .npz file.
+        like: a set (of arrays or shapes) with the expected names, types and shapes, say from `jax.eval_shape`.
+
+    Raises:
+        ValueError: for an array that is missing or has another type or shape; the message names it.
+    """
+    loaded = []
+    with np.load(path, allow_pickle=False) as arrays:
+        for name, expected in leaves(like).items():
+            if name not in arrays:
+                raise ValueError(f"{path}: {name}: missing, expected {expected.dtype} {expected.shape}")
+            array = arrays[name]
+            if array.shape != expected.shape or array.dtype != expected.dtype:
+                raise ValueError(
+                    f"{path}: {name}: got {array.dtype} {array.shape}, expected {expected.dtype} {expected.shape}"
+                )
+            loaded.append(jnp.asarray(array))
+    return jax.tree.unflatten(jax.tree.structure(like), loaded)

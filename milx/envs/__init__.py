@@ -1,0 +1,23 @@
+"""Environments by name."""
+
+from milx.envs.base import SPLITS, Env, State, Task
+from milx.envs.reach import Reach
+
+ENVS: dict[str, type[Env]] = {Reach.name: Reach}
+
+__all__ = ["ENVS", "SPLITS", "Env", "State", "Task", "make"]
+
+
+def make(name: str, image_shape: tuple[int, int] | None = None) -> Env:
+    """Builds an environment.
+
+    Args:
+        name: a key of ENVS.
+        image_shape: (H, W) in pixels; the published experiment's if None.
+
+    Raises:
+        ValueError: for a name that does not exist; the message lists those that do.
+    """
+    if name not in ENVS:
+        raise ValueError(f"env: got {name!r}, expected one of {', '.join(ENVS)}")
+    return ENVS[name](image_shape)

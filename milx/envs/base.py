@@ -1,0 +1,164 @@
+"""The environment interface: pure functions of a task and a state, batched by `jax.vmap`.
+
+A *task* says what is to be done and how the world looks (colours, shapes, masses); every demonstration and trial of a
+task starts in another *scene* (positions), which lives in the state. Both are pytrees of arrays.
+"""
+
+import abc
+import dataclasses
+import pathlib
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+from mujoco import mjx
+
+from milx.render.scene import Renderer, to_uint8
+from milx.types import Observation
+
+Task = Any
+SPLITS = ("train", "validation", "test")
+ASSETS = pathlib.Path(__file__).parent / "assets"
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class State:
+    """The physical state of one world (any leading axes may stand in front).
+
+    Attributes:
+        qpos: [nq] joint positions (rad, m).
+        qvel: [nv] joint velocities (rad/s, m/s).
+        mocap_pos: [O, 3] positions of the bodies that stand where the scene puts them (m).
+    """
+
+    qpos: jax.Array
+    qvel: jax.Array
+    mocap_pos: jax.Array
+
+    @property
+    def vector(self) -> jax.Array:
+        """[nq + nv]: the part of the state that the dynamics change, as trajectory optimisation sees it."""
+        return jnp.concatenate([self.qpos, self.qvel], axis=-1)
+
+    def with_vector(self, x: jax.Array) -> "State":
+        """The same scene with `qpos` and `qvel` taken from `x` [nq + nv]."""
+        nq = self.qpos.shape[-1]
+        return dataclasses.replace(self, qpos=x[..., :nq], qvel=x[..., nq:])
+
+
+class Env(abc.ABC):
+    """A simulated environment on MJX.
+
+    Subclasses set the class attributes and write the abstract methods; all methods are pure and take one world, `jax.vmap` gives batches.
+
+    Attributes:
+        name: the registry's key.
+        horizon: T, actions in an episode.
+        substeps: physics steps in one action.
+        image_shape: (H, W) of the published experiment.
+        camera: the MJCF camera that the policy sees through.
+        criterion: what counts as success, in words, for result files.
+        goal_indices: entries of the robot's state that tell, at the end of a demonstration, where it went.
+    """
+
+    name: str
+    horizon: int
+    substeps: int
+    image_shape: tuple[int, int]
+    camera: str
+    criterion: str
+    goal_indices: tuple[int, ...]
+
+    def __init__(self, model: mujoco.MjModel, image_shape: tuple[int, int] | None = None):
+        self.mj_model = model
+        self.model = mjx.put_model(model)
+        self.image_shape = tuple(image_shape or self.image_shape)
+        self.renderer = Renderer(model, self.camera, *self.image_shape)
+        self._data = mjx.make_data(self.model)
+
+    @property
+    def action_size(self) -> int:
+        """A, the number of actuators."""
+        return self.mj_model.nu
+
+    @property
+    def action_range(self) -> tuple[jax.Array, jax.Array]:
+        """The lowest and highest action, [A] each; `step` clips to it."""
+        low, high = self.mj_model.actuator_ctrlrange.T
+        return jnp.asarray(low, jnp.float32), jnp.asarray(high, jnp.float32)
+
+    @property
+    @abc.abstractmethod
+    def state_size(self) -> int:
+        """S, the size of `observe(...).state`."""
+
+    @abc.abstractmethod
+    def sample_task(self, key: jax.Array, split: str) -> Task:
+        """Draws a task of a split ("train", "validation" or "test"); raises ValueError for another split."""
+
+    @abc.abstractmethod
+    def reset(self, key: jax.Array, task: Task) -> State:
+        """Draws a scene of the task: the state at the start of an episode."""
+
+    @abc.abstractmethod
+    def robot_state(self, state: State) -> jax.Array:
+        """[S] what the robot knows of itself (units in the subclass)."""
+
+    @abc.abstractmethod
+    def colors(self, task: Task) -> jax.Array:
+        """[G, 4] RGBA of every geom in this task, in [0, 1]."""
+
+    @abc.abstractmethod
+    def running_residual(self, task: Task, state: State, action: jax.Array, t: jax.Array) -> jax.Array:
+        """[R] the running cost's residual at step t: the expert minimises half its square."""
+
+    @abc.abstractmethod
+    def terminal_residual(self, task: Task, state: State) -> jax.Array:
+        """[R'] the terminal cost's residual."""
+
+    @abc.abstractmethod
+    def success(self, task: Task, states: State) -> jax.Array:
+        """Whether an episode succeeded. `states` has a leading axis T + 1; returns a bool scalar."""
+
+    @abc.abstractmethod
+    def task_blind(self, key: jax.Array, task: Task) -> Task:
+        """The task as someone understands it who saw no demonstration: a random candidate is the target."""
+
+    def running_cost(self, task: Task, state: State, action: jax.Array, t: jax.Array) -> jax.Array:
+        """Scalar cost of one step: half the square of the running residual."""
+        return 0.5 * jnp.sum(self.running_residual(task, state, action, t) ** 2)
+
+    def terminal_cost(self, task: Task, state: State) -> jax.Array:
+        """Scalar cost of the final state: half the square of the terminal residual."""
+        return 0.5 * jnp.sum(self.terminal_residual(task, state) ** 2)
+
+    def data(self, state: State) -> mjx.Data:
+        """MJX data holding this state; derived quantities are not computed yet."""
+        return self._data.replace(qpos=state.qpos, qvel=state.qvel, mocap_pos=state.mocap_pos)
+
+    def step(self, task: Task, state: State, action: jax.Array) -> State:
+        """Applies `action` [A], clipped to `action_range`, for `substeps` physics steps."""
+        ctrl = jnp.clip(action, *self.action_range)
+
+        # Only positions and velocities are carried: MJX's data is large, and the rest follows from them.
+        def substep(x, _):
+            data = mjx.step(self.model, self.data(state.with_vector(x)).replace(ctrl=ctrl))
+            return jnp.concatenate([data.qpos, data.qvel]), None
+
+        x, _ = jax.lax.scan(substep, state.vector, length=self.substeps)
+        return state.with_vector(x)
+
+    def observe(self, task: Task, state: State) -> Observation:
+        """Renders the task's scene: image [H, W, 3] uint8 and robot state [S]."""
+        data = mjx.kinematics(self.model, self.data(state))
+        data = mjx.camlight(self.model, mjx.com_pos(self.model, data))
+        scene = dataclasses.replace(self.renderer.scene(data), geom_rgba=self.colors(task))
+        return Observation(image=to_uint8(self.renderer.render(scene).color), state=self.robot_state(state))
+
+
+def check_split(split: str) -> None:
+    """Raises ValueError unless `split` is one of SPLITS."""
+    if split not in SPLITS:
+        raise ValueError(f"split: got {split!r}, expected one of {', '.join(SPLITS)}")

@@ -1,0 +1,119 @@
+"""Vision reach: a planar two-joint arm goes to the cube of the demonstrated colour (paper, Section 6.1)."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from mujoco import mjx
+
+from milx.envs.base import ASSETS, Env, State, check_split
+
+NUM_OBJECTS = 3
+EXTENT = 0.2
+"""Cubes stand within +-EXTENT of the arm's base in x and y (m)."""
+SPACING = 0.15
+"""Least distance between two cubes' centres (m)."""
+TOUCH = 0.05
+"""A fingertip closer than this to the target's centre, seen from above, has reached it (m)."""
+LAST_STEPS = 10
+"""The target must be touched in one of the last steps of the episode."""
+# Colour grids {offset, offset + 0.1, ...}^3 of the splits: disjoint, so that test and validation colours are held out.
+COLOR_OFFSETS = {"train": 0.0, "validation": 0.025, "test": 0.05}
+ACTION_COST = 1.0
+VELOCITY_COST = 0.02
+_CANDIDATES = 64
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class ReachTask:
+    """Which colour to go to.
+
+    Attributes:
+        object_color: [3, 3] RGB in [0, 1] of the cubes.
+        target: int32, which of them is the target.
+    """
+
+    object_color: jax.Array
+    target: jax.Array
+
+
+class Reach(Env):
+    """Two joints, three cubes, 80x64 pixels from above, 50 actions of 0.05 s.
+
+    The robot's state is 8-dimensional: two joint angles (rad), two joint velocities (rad/s), the fingertip's position
+    (m) and velocity (m/s) in the plane. An action is two motor commands in [-1, 1].
+    """
+
+    name = "reach"
+    horizon = 50
+    substeps = 5
+    image_shape = (64, 80)
+    camera = "overhead"
+    criterion = f"fingertip within {TOUCH} m of the target in one of the last {LAST_STEPS} of 50 steps"
+    state_size = 8
+    goal_indices = (4, 5)
+
+    def __init__(self, image_shape: tuple[int, int] | None = None):
+        super().__init__(mujoco.MjModel.from_xml_path(str(ASSETS / "reach.xml")), image_shape)
+        names = ["target", "distractor_0", "distractor_1"]
+        self._object_geoms = np.array([self.mj_model.geom(name).id for name in names])
+        self._rgba = jnp.asarray(self.mj_model.geom_rgba, jnp.float32)
+        self._height = float(self.mj_model.body("target").pos[2])
+        self._fingertip = self.mj_model.site("fingertip").id
+
+    def sample_task(self, key: jax.Array, split: str) -> ReachTask:
+        """Draws three different colours from the split's grid, and the target among them."""
+        check_split(split)
+        color_key, target_key = jax.random.split(key)
+        index = jax.random.choice(color_key, 1000, (NUM_OBJECTS,), replace=False)
+        grid = jnp.stack([index // 100, index // 10 % 10, index % 10], axis=-1)
+        target = jax.random.randint(target_key, (), 0, NUM_OBJECTS)
+        return ReachTask(object_color=grid * 0.1 + COLOR_OFFSETS[split], target=target)
+
+    def reset(self, key: jax.Array, task: ReachTask) -> State:
+        """Stands the arm at zero and the cubes uniformly in the arena, at least SPACING apart."""
+        draws = jax.random.uniform(key, (_CANDIDATES, NUM_OBJECTS, 2), minval=-EXTENT, maxval=EXTENT)
+        gaps = jnp.linalg.norm(draws[:, [0, 0, 1]] - draws[:, [1, 2, 2]], axis=-1)
+        # The first draw that keeps the distances; each does with probability 0.31, so one of 64 always does.
+        position = draws[jnp.argmax(gaps.min(axis=-1) >= SPACING)]
+        height = jnp.full((NUM_OBJECTS, 1), self._height)
+        return State(jnp.zeros(2), jnp.zeros(2), jnp.concatenate([position, height], axis=-1))
+
+    def fingertip(self, qpos: jax.Array) -> jax.Array:
+        """[2] position of the fingertip in the plane (m) for joint angles [2]."""
+        data = mjx.kinematics(self.model, self._data.replace(qpos=qpos))
+        return data.site_xpos[self._fingertip, :2]
+
+    def robot_state(self, state: State) -> jax.Array:
+        """[8] joint angles, joint velocities, fingertip position, fingertip velocity."""
+        position, velocity = jax.jvp(self.fingertip, (state.qpos,), (state.qvel,))
+        return jnp.concatenate([state.qpos, state.qvel, position, velocity])
+
+    def colors(self, task: ReachTask) -> jax.Array:
+        """[G, 4] RGBA of every geom."""
+        return self._rgba.at[self._object_geoms, :3].set(task.object_color)
+
+    def off_target(self, task: ReachTask, state: State) -> jax.Array:
+        """[2] from the target to the fingertip in the plane (m)."""
+        return self.fingertip(state.qpos) - state.mocap_pos[task.target, :2]
+
+    def running_residual(self, task: ReachTask, state: State, action: jax.Array, t: jax.Array) -> jax.Array:
+        """[6] fingertip off target (m), joint velocities and motor commands, weighted."""
+        return jnp.concatenate([self.off_target(task, state), VELOCITY_COST * state.qvel, ACTION_COST * action])
+
+    def terminal_residual(self, task: ReachTask, state: State) -> jax.Array:
+        """[4] fingertip off target (m) and joint velocities, weighted."""
+        return jnp.concatenate([5.0 * self.off_target(task, state), VELOCITY_COST * state.qvel])
+
+    def success(self, task: ReachTask, states: State) -> jax.Array:
+        """Whether the fingertip touched the target in one of the last LAST_STEPS steps (paper, Appendix A)."""
+        last = jax.tree.map(lambda x: x[-LAST_STEPS:], states)
+        gap = jax.vmap(self.off_target, in_axes=(None, 0))(task, last)
+        return jnp.any(jnp.linalg.norm(gap, axis=-1) < TOUCH)
+
+    def task_blind(self, key: jax.Array, task: ReachTask) -> ReachTask:
+        """The task with a random cube as the target."""
+        return dataclasses.replace(task, target=jax.random.randint(key, (), 0, NUM_OBJECTS))

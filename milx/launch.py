@@ -1,0 +1,71 @@
+"""What the launchers share: flags that everybody sets, and overrides of single configuration fields."""
+
+import sys
+from collections.abc import Callable, Sequence
+
+import jax
+from absl import app, flags
+from ml_collections import config_flags
+
+from milx import config as config_lib
+from milx.config import PRESETS, Config
+from milx.envs import ENVS
+from milx.methods import METHODS
+
+FLAGS = flags.FLAGS
+
+
+def define_flags() -> None:
+    """Defines --env, --method, --preset, --seed and --workdir."""
+    flags.DEFINE_string("env", "reach", f"Environment: {', '.join(ENVS)}.")
+    flags.DEFINE_string("method", "mil", f"Method: {', '.join(METHODS)}.")
+    flags.DEFINE_string(
+        "preset",
+        None,
+        "Hyperparameters: paper (as published), fast (the best for an accelerator, its default), cpu (smaller images and "
+        "networks; the default without an accelerator). Any field can be changed with --config.path.to.field=value.",
+    )
+    flags.DEFINE_integer("seed", 0, "Seed of training tasks, initial parameters and batches.", lower_bound=0)
+    flags.DEFINE_string("workdir", None, "Folder of the run; default runs/<env>-<method>-<preset>-<seed>.")
+
+
+def run(main: Callable[[Config, str], None]) -> None:
+    """Parses the command line and calls `main(config, workdir)`; bad input ends with a message, not a traceback."""
+
+    def parse(argv: Sequence[str]) -> list[str]:
+        own = [arg for arg in argv if not arg.startswith(("--config", "-config"))]
+        FLAGS(own)
+        preset = FLAGS.preset or ("cpu" if jax.default_backend() == "cpu" else "fast")
+        try:
+            config = config_lib.make_config(FLAGS.env, FLAGS.method, preset, FLAGS.seed)
+        except ValueError as error:
+            raise flags.Error(str(error)) from error
+        _check_fields(argv, config)
+        config_flags.DEFINE_config_dataclass("config", config, "Every hyperparameter.", sys_argv=list(argv))
+        return FLAGS(argv)
+
+    def start(argv: Sequence[str]) -> None:
+        if len(argv) > 1:
+            raise app.UsageError(f"unexpected argument {argv[1]!r}")
+        config = FLAGS.config
+        if FLAGS.preset is None:
+            backend = jax.default_backend()
+            print(
+                f"Running on {backend} with --preset={config.preset}, its default; choose with --preset={{{','.join(PRESETS[config.env_name])}}}."
+            )
+        workdir = FLAGS.workdir or f"runs/{config.env_name}-{config.method_name}-{config.preset}-{config.seed}"
+        try:
+            main(config, workdir)
+        except ValueError as error:
+            sys.exit(f"milx: {error}")
+
+    app.run(start, flags_parser=parse)
+
+
+def _check_fields(argv: Sequence[str], config: Config) -> None:
+    """Raises flags.Error for --config.NAME where there is no such field; lists those that exist."""
+    known = config_lib.flatten(config_lib.to_dict(config))
+    for arg in argv[1:]:
+        name = arg.lstrip("-").split("=")[0]
+        if name.startswith("config.") and name.removeprefix("config.") not in known:
+            raise flags.Error(f"--{name}: no such field, expected one of\n  " + "\n  ".join(known))

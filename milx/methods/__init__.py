@@ -1,0 +1,49 @@
+"""Methods by name, built from a configuration and the sizes of what they see and do."""
+
+import dataclasses
+from collections.abc import Callable
+
+from milx.config import Config
+from milx.methods.base import Method
+from milx.methods.maml import MIL
+from milx.networks.policy import make_policy
+
+__all__ = ["METHODS", "Method", "Spec", "make"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Spec:
+    """The sizes of what a policy sees and does.
+
+    Attributes:
+        image_shape: (H, W).
+        state_size: S.
+        action_size: A.
+        goal_indices: entries of the state that tell, at the end of a demonstration, where it went.
+    """
+
+    image_shape: tuple[int, int]
+    state_size: int
+    action_size: int
+    goal_indices: tuple[int, ...]
+
+
+def _make_mil(config: Config, spec: Spec) -> Method:
+    network = make_policy(
+        config.network, spec.image_shape, spec.state_size, spec.action_size, goal_size=len(spec.goal_indices)
+    )
+    return MIL(config.mil, network, spec.goal_indices)
+
+
+METHODS: dict[str, Callable[[Config, Spec], Method]] = {"mil": _make_mil}
+
+
+def make(config: Config, spec: Spec) -> Method:
+    """Builds the method that `config.method_name` names.
+
+    Raises:
+        ValueError: for a name that does not exist; the message lists those that do.
+    """
+    if config.method_name not in METHODS:
+        raise ValueError(f"method: got {config.method_name!r}, expected one of {', '.join(METHODS)}")
+    return METHODS[config.method_name](config, spec)

@@ -1,0 +1,36 @@
+"""The interface of every method: trainer, evaluator and users know nothing else."""
+
+import abc
+
+import jax
+
+from milx.types import Demo, Memory, Observation, Params, TaskBatch
+from milx.whitening import Whitening
+
+
+class Method(abc.ABC):
+    """One way to learn from one demonstration. All methods are pure; the object holds only configuration.
+
+    `params` is what meta-training learns; `task_params` is what the policy needs once it has seen a demonstration.
+    """
+
+    @abc.abstractmethod
+    def init(self, key: jax.Array, whitening: Whitening) -> Params:
+        """Draws the parameters at the start of meta-training; they carry the whitening of states and actions."""
+
+    @abc.abstractmethod
+    def loss(self, params: Params, batch: TaskBatch) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """The meta-objective of a batch of tasks: a scalar, and scalars worth a curve."""
+
+    @abc.abstractmethod
+    def adapt(self, params: Params, demo: Demo) -> Params:
+        """Learns a task from demonstrations with axes [K, T, ...]; returns `task_params`."""
+
+    @abc.abstractmethod
+    def act(self, task_params: Params, observation: Observation, memory: Memory) -> tuple[jax.Array, Memory]:
+        """Chooses the action [A], in the environment's units, for one observation; returns it and the next memory."""
+
+    def initial_memory(self, key: jax.Array) -> Memory:
+        """The memory at the start of an episode; `key` is for methods that act at random."""
+        del key
+        return ()

@@ -1,0 +1,99 @@
+"""Meta-imitation learning: MAML through a step of behavioural cloning (paper, Section 4).
+
+For a task with demonstrations d (support) and d' (query) of the same goal in different scenes,
+
+    theta' = theta - alpha * clip(grad_theta L(theta, d))        the inner step, eq. 1
+    minimise over theta:  sum over tasks of L(theta', d')        the meta-objective, eq. 3
+
+with the behavioural cloning loss L(theta, d) = mean over t of |m (a_t - pi_theta(o_t))|^2, eq. 2. `jax.grad` goes
+through the inner step, `vmap` over the tasks.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+
+from milx.config import MILConfig
+from milx.methods.base import Method
+from milx.networks.policy import PolicyNetwork
+from milx.types import Demo, Memory, Observation, Params, TaskBatch
+from milx.whitening import Whitening
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class MIL(Method):
+    """Meta-imitation learning with one or two heads.
+
+    `params` holds the network's parameters ("policy"), the whitening, which no gradient reaches, and, if the inner
+    learning rate is learned, the logarithm of its factor for every tensor ("inner_log_lr"). `task_params` holds the
+    adapted network's parameters and the whitening.
+
+    Attributes:
+        config: inner steps and losses.
+        network: the policy network.
+        goal_indices: entries of the state at a demonstration's last step that the goal head predicts.
+    """
+
+    config: MILConfig
+    network: PolicyNetwork
+    goal_indices: tuple[int, ...] = ()
+
+    def init(self, key: jax.Array, whitening: Whitening) -> Params:
+        """Draws the network's parameters."""
+        params = {"policy": self.network.init(key), "whitening": whitening}
+        if self.config.learn_inner_lr:
+            params["inner_log_lr"] = jax.tree.map(lambda _: jnp.zeros(()), params["policy"])
+        return params
+
+    def adapt(self, params: Params, demo: Demo) -> Params:
+        """Takes the inner gradient steps (eq. 1) on demonstrations [K, T, ...]: their gradients are averaged."""
+        theta = params["policy"]
+        rates = jax.tree.map(lambda _: self.config.inner_lr, theta)
+        if self.config.learn_inner_lr:
+            rates = jax.tree.map(lambda s: self.config.inner_lr * jnp.exp(s), params["inner_log_lr"])
+        for _ in range(self.config.inner_steps):
+            grad, _ = jax.grad(self.imitation_loss, has_aux=True)(theta, params["whitening"], demo, inner=True)
+            if self.config.first_order:
+                grad = jax.lax.stop_gradient(grad)
+            clip = self.config.inner_clip
+            theta = jax.tree.map(lambda p, g, rate: p - rate * jnp.clip(g, -clip, clip), theta, grad, rates)
+        return {"policy": theta, "whitening": params["whitening"]}
+
+    def loss(self, params: Params, batch: TaskBatch) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """The meta-objective (eq. 3), averaged over the tasks."""
+
+        def task_loss(support: Demo, query: Demo) -> tuple[jax.Array, dict[str, jax.Array]]:
+            adapted = self.adapt(params, support)
+            return self.imitation_loss(adapted["policy"], adapted["whitening"], query)
+
+        loss, metrics = jax.vmap(task_loss)(batch.support, batch.query)
+        return loss.mean(), jax.tree.map(jnp.mean, metrics)
+
+    def act(self, task_params: Params, observation: Observation, memory: Memory) -> tuple[jax.Array, Memory]:
+        """The adapted network's action for one observation."""
+        whitening = task_params["whitening"]
+        state = whitening.state(observation.state)
+        output = self.network.apply(task_params["policy"], observation.image[None], state[None])
+        return whitening.unwhiten_action(output.action[0]), memory
+
+    def imitation_loss(
+        self, theta: Params, whitening: Whitening, demo: Demo, inner: bool = False
+    ) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """Behavioural cloning (eq. 2) on demonstrations [K, T, ...], plus the goal head's error where there is one.
+
+        `inner` selects the head of the inner loss. Returns the sum and its parts.
+        """
+        whitening = jax.lax.stop_gradient(whitening)
+        flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), demo)
+        state = whitening.state(demo.state)
+        output = self.network.apply(theta, flat.image, state.reshape(-1, state.shape[-1]))
+        action = output.inner_action if inner else output.action
+        error = self.config.loss_scale * (action - whitening.action(flat.action))
+        loss = action_loss = jnp.mean(jnp.square(error))
+        metrics = {"action_loss": action_loss}
+        if output.goal is not None:
+            goal = state[:, -1:, jnp.array(self.goal_indices)]
+            metrics["goal_loss"] = jnp.mean(jnp.square(output.goal.reshape(*state.shape[:2], -1) - goal))
+            loss += self.config.goal_weight * metrics["goal_loss"]
+        return loss, metrics

@@ -1,0 +1,42 @@
+"""A policy that sees nothing: the floor below all others."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+
+from milx.methods.base import Method
+from milx.types import Demo, Memory, Observation, Params, TaskBatch
+from milx.whitening import Whitening
+
+
+@dataclasses.dataclass(frozen=True)
+class Random(Method):
+    """Actions from a standard normal distribution, as in the paper's random baseline.
+
+    Attributes:
+        action_size: A.
+    """
+
+    action_size: int
+
+    def init(self, key: jax.Array, whitening: Whitening) -> Params:
+        """Nothing to learn."""
+        return ()
+
+    def loss(self, params: Params, batch: TaskBatch) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """Zero: nothing to learn."""
+        return jnp.zeros(()), {}
+
+    def adapt(self, params: Params, demo: Demo) -> Params:
+        """Ignores the demonstration."""
+        return ()
+
+    def act(self, task_params: Params, observation: Observation, memory: Memory) -> tuple[jax.Array, Memory]:
+        """Draws an action; the memory is a key."""
+        key, next_key = jax.random.split(memory)
+        return jax.random.normal(key, (self.action_size,)), next_key
+
+    def initial_memory(self, key: jax.Array) -> Memory:
+        """The key of the episode's draws."""
+        return key

@@ -1,0 +1,167 @@
+"""The policy that users hold: loaded from a run, adapted to a demonstration, asked for actions."""
+
+import dataclasses
+import functools
+import json
+import pathlib
+from typing import Any
+
+import jax
+import numpy as np
+
+from milx import config as config_lib
+from milx import envs, methods
+from milx.checkpoint import Checkpoints
+from milx.methods import Method, Spec
+from milx.types import Demo, Observation, Params
+from milx.whitening import Whitening
+
+
+def spec_of(env: envs.Env) -> Spec:
+    """The sizes of what a policy sees and does in an environment."""
+    return Spec(env.image_shape, env.state_size, env.action_size, env.goal_indices)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Policy:
+    """A trained method with its parameters.
+
+        policy = milx.load("runs/reach")
+        task_params = policy.adapt(policy.params, demo)
+        action = policy.act(task_params, observation)
+
+    Attributes:
+        method: how to adapt and act.
+        spec: the sizes of what it sees and does.
+        params: what meta-training has learnt.
+        config: the run's configuration.
+    """
+
+    method: Method
+    spec: Spec
+    params: Params
+    config: config_lib.Config
+
+    def adapt(self, params: Params, demo: Demo) -> Params:
+        """Learns a task from one demonstration [T, ...] or several [K, T, ...]; jitted.
+
+        Args:
+            params: `policy.params`.
+            demo: images [.., T, H, W, 3] uint8, states [.., T, S] and actions [.., T, A], NumPy or JAX.
+
+        Returns:
+            task_params for `act`.
+
+        Raises:
+            ValueError: for a field that is missing or has a wrong shape or type, or a value that is not finite.
+        """
+        return self._adapt(params, check_demo(demo, self.spec))
+
+    def act(self, task_params: Params, observation: Observation) -> jax.Array:
+        """The action [A], in the environment's units, for one observation; jitted.
+
+        Raises:
+            ValueError: for a field that is missing or has a wrong shape or type, or a value that is not finite.
+        """
+        return self._act(task_params, check_observation(observation, self.spec))
+
+    @functools.cached_property
+    def _adapt(self) -> Any:
+        return jax.jit(self.method.adapt)
+
+    @functools.cached_property
+    def _act(self) -> Any:
+        return jax.jit(lambda task_params, observation: self.method.act(task_params, observation, ())[0])
+
+
+def load(run: str | pathlib.Path) -> Policy:
+    """Loads the best policy of a run.
+
+    Args:
+        run: the run's folder, as `python -m milx.train` leaves it.
+
+    Raises:
+        ValueError: if the folder holds no run, or no checkpoint yet.
+    """
+    folder = pathlib.Path(run)
+    path = folder / "config.json"
+    if not path.is_file():
+        raise ValueError(f"run: {folder} has no config.json, expected a folder written by `python -m milx.train`")
+    config = config_lib.from_dict(json.loads(path.read_text()))
+    spec = spec_of(envs.make(config.env_name, config.env.image_shape))
+    method = methods.make(config, spec)
+    checkpoints = Checkpoints(folder / "checkpoints", read_only=True)
+    if checkpoints.best is None:
+        raise ValueError(f"run: {folder} has no checkpoint yet")
+    items, _ = checkpoints.restore(checkpoints.best, {"params": params_like(method, spec)})
+    return Policy(method, spec, items["params"], config)
+
+
+def params_like(method: Method, spec: Spec) -> Params:
+    """Shapes and types of a method's parameters."""
+    state, action = (jax.ShapeDtypeStruct((size,), np.float32) for size in (spec.state_size, spec.action_size))
+    return jax.eval_shape(method.init, jax.random.key(0), Whitening(state, state, action, action))
+
+
+def check_demo(demo: Demo, spec: Spec) -> Demo:
+    """Checks demonstrations and gives them their leading axis K.
+
+    Raises:
+        ValueError: naming the field, what came and what was expected.
+    """
+    lead = np.ndim(_require("demo.action", demo.action)) - 2
+    if lead not in (0, 1):
+        raise ValueError(f"demo.action: got shape {np.shape(demo.action)}, expected [T, A] or [K, T, A]")
+    shape = np.shape(demo.action)[: lead + 1]
+    if 0 in shape:
+        raise ValueError(f"demo.action: got shape {np.shape(demo.action)}, expected at least one time step")
+    checked = Demo(
+        image=_check_image("demo.image", demo.image, (*shape, *spec.image_shape, 3)),
+        state=_check_vector("demo.state", demo.state, (*shape, spec.state_size)),
+        action=_check_vector("demo.action", demo.action, (*shape, spec.action_size)),
+    )
+    return checked if lead else jax.tree.map(lambda x: x[None], checked)
+
+
+def check_observation(observation: Observation, spec: Spec) -> Observation:
+    """Checks one observation.
+
+    Raises:
+        ValueError: naming the field, what came and what was expected.
+    """
+    return Observation(
+        image=_check_image("observation.image", observation.image, (*spec.image_shape, 3)),
+        state=_check_vector("observation.state", observation.state, (spec.state_size,)),
+    )
+
+
+def _require(field: str, value: Any) -> Any:
+    if value is None:
+        raise ValueError(f"{field}: missing, expected an array")
+    return value
+
+
+def _check_image(field: str, value: Any, shape: tuple[int, ...]) -> jax.Array | np.ndarray:
+    array = _check_shape(field, value, shape)
+    if array.dtype != np.uint8:
+        raise ValueError(f"{field}: got {array.dtype}, expected uint8 in [0, 255]")
+    return array
+
+
+def _check_vector(field: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
+    array = _check_shape(field, value, shape)
+    if array.dtype.kind not in "fiu":
+        raise ValueError(f"{field}: got {array.dtype}, expected real numbers")
+    array = np.asarray(array, np.float32)
+    if not np.isfinite(array).all():
+        index = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
+        raise ValueError(f"{field}: got {array[index]} at {index}, expected finite numbers")
+    return array
+
+
+def _check_shape(field: str, value: Any, shape: tuple[int, ...]) -> Any:
+    array = _require(field, value)
+    array = array if isinstance(array, jax.Array) else np.asarray(array)
+    if array.shape != shape:
+        raise ValueError(f"{field}: got shape {list(array.shape)}, expected {list(shape)}")
+    return array

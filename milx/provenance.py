@@ -1,0 +1,45 @@
+"""Where a result comes from: commit, hardware and versions."""
+
+import importlib.metadata
+import os
+import pathlib
+import platform
+import subprocess
+from typing import Any
+
+import jax
+
+_PACKAGES = ("milx", "jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "orbax-checkpoint", "numpy")
+
+
+def describe() -> dict[str, Any]:
+    """Commit (with "-dirty" for a changed tree; None outside a checkout), hardware and versions, for a result file."""
+    return {"commit": _commit(), "hardware": _hardware(), "versions": _versions()}
+
+
+def _commit() -> str | None:
+    if "MILX_COMMIT" in os.environ:
+        return os.environ["MILX_COMMIT"]
+    folder = pathlib.Path(__file__).parent
+    command = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+    try:
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return done.stdout.strip()
+
+
+def _hardware() -> str:
+    devices = jax.devices()
+    kind = devices[0].device_kind if devices[0].platform != "cpu" else platform.processor() or platform.machine()
+    return f"{len(devices)} x {kind}, {os.cpu_count()} CPU cores"
+
+
+def _versions() -> dict[str, str]:
+    versions = {"python": platform.python_version()}
+    for package in _PACKAGES:
+        try:
+            versions[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            versions[package] = "not installed"
+    return versions

@@ -1,0 +1,270 @@
+"""Scene, Frame and Renderer: from an MJX state to an image.
+
+The camera looks along its -z axis, x to the right and y up. `G` denotes all geoms of the model and `L` all its lights,
+in MuJoCo's order. The background is black, as in MuJoCo's renderer for a model without a skybox.
+"""
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from mujoco import mjx
+
+from milx.render import raycast, shade
+
+_DIRECTIONAL = int(mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
+_SPOT = int(mujoco.mjtLightType.mjLIGHT_SPOT)
+# MuJoCo shows the geom groups 0, 1 and 2 unless told otherwise.
+_SHOWN_GROUPS = 3
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """What can vary from frame to frame; float32, in world coordinates.
+
+    A geom whose alpha is 0 is not seen and casts no shadow; any other alpha is opaque.
+    """
+
+    geom_xpos: jax.Array  # [G, 3] m
+    geom_xmat: jax.Array  # [G, 3, 3]
+    geom_size: jax.Array  # [G, 3] m
+    geom_rgba: jax.Array  # [G, 4]
+    cam_xpos: jax.Array  # [3] m
+    cam_xmat: jax.Array  # [3, 3]
+    light_xpos: jax.Array  # [L, 3] m; lights that the model has switched off stay off
+    light_xdir: jax.Array  # [L, 3] the way the light shines
+    light_ambient: jax.Array  # [L, 3]
+    light_diffuse: jax.Array  # [L, 3]
+    light_specular: jax.Array  # [L, 3]
+    headlight: jax.Array  # [3, 3] ambient, diffuse and specular colour of the light that shines along the view
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Frame:
+    """An image."""
+
+    color: jax.Array  # [H, W, 3] float32 in [0, 1]
+    depth: jax.Array  # [H, W] float32, m along the optical axis, infinite where nothing is hit
+    geom_id: jax.Array  # [H, W] int32, MuJoCo's geom id, -1 where nothing is hit
+
+
+def to_uint8(color: jax.Array) -> jax.Array:
+    """Colours in [0, 1] as uint8 in [0, 255], rounded."""
+    return jnp.round(255 * jnp.clip(color, 0.0, 1.0)).astype(jnp.uint8)
+
+
+class Renderer:
+    """Renders one camera of a model; pure functions to be used under `jax.jit` and `jax.vmap`.
+
+    All geoms in groups 0 to 2 are rendered, as MuJoCo does by default. Near and far planes are MuJoCo's
+    (`visual/map/znear` and `zfar`, in units of the model's extent). The colour is differentiable with respect to the
+    colours and the lights; the geometry carries no gradient.
+    """
+
+    def __init__(
+        self, model: mujoco.MjModel, camera: str | int, height: int, width: int, *, shadows: bool = False
+    ) -> None:
+        """Prepares what does not change from frame to frame.
+
+        Args:
+            model: the model.
+            camera: name or id of a perspective camera.
+            height: of the image, in pixels.
+            width: of the image, in pixels.
+            shadows: whether lights with `castshadow` throw hard shadows; each costs about as much as all the rest.
+
+        Raises:
+            ValueError: there is no such camera, or the model asks for what this renderer cannot show.
+        """
+        for name, value in (("height", height), ("width", width)):
+            if value < 1:
+                raise ValueError(f"{name}={value!r}: expected at least 1 pixel")
+        self.height, self.width = height, width
+        self._camera = _find_camera(model, camera)
+        self._model = model
+        self._near, self._far = (float(edge * model.stat.extent) for edge in (model.vis.map.znear, model.vis.map.zfar))
+        self._groups = _group_geoms(model)
+        _check_lights(model)
+        self._shadows = shadows
+        self._materials = _materials(model)
+
+        half_height = np.tan(np.deg2rad(model.cam_fovy[self._camera]) / 2)
+        x = (2 * (np.arange(width) + 0.5) / width - 1) * half_height * width / height
+        y = (1 - 2 * (np.arange(height) + 0.5) / height) * half_height
+        x, y = np.meshgrid(x, y)
+        self._rays = (np.float32(x).ravel(), np.float32(y).ravel(), np.float32(-1))
+
+    def scene(self, data: mjx.Data | mujoco.MjData) -> Scene:
+        """The scene as the data has it: poses from the data; colours, sizes and lights from the model.
+
+        Args:
+            data: a state after `kinematics`, `com_pos` and `camlight`, or after `forward` or `step`.
+        """
+        model = self._model
+
+        def array(values, *shape: int) -> jax.Array:
+            return jnp.asarray(values, jnp.float32).reshape(shape)
+
+        # MJX keeps no light poses. Lights are fixed to their bodies, so they follow from those.
+        body_xpos = array(data.xpos, -1, 3)[model.light_bodyid]
+        body_xmat = array(data.xmat, -1, 3, 3)[model.light_bodyid]
+        head = model.vis.headlight
+        return Scene(
+            geom_xpos=array(data.geom_xpos, -1, 3),
+            geom_xmat=array(data.geom_xmat, -1, 3, 3),
+            geom_size=array(model.geom_size, -1, 3),
+            geom_rgba=array(_geom_rgba(model), -1, 4),
+            cam_xpos=array(data.cam_xpos[self._camera], 3),
+            cam_xmat=array(data.cam_xmat[self._camera], 3, 3),
+            light_xpos=body_xpos + _rotate(body_xmat, array(model.light_pos, -1, 3)),
+            light_xdir=_rotate(body_xmat, array(model.light_dir, -1, 3)),
+            light_ambient=array(model.light_ambient, -1, 3),
+            light_diffuse=array(model.light_diffuse, -1, 3),
+            light_specular=array(model.light_specular, -1, 3),
+            headlight=array(head.active * np.stack([head.ambient, head.diffuse, head.specular]), 3, 3),
+        )
+
+    def render(self, scene: Scene) -> Frame:
+        """The image of a scene."""
+        geometry = jax.lax.stop_gradient(
+            (scene.geom_xpos, scene.geom_xmat, scene.geom_size, scene.cam_xpos, scene.cam_xmat)
+        )
+        maps = raycast.unit_maps(self._model.geom_type, *geometry)
+        visible = scene.geom_rgba[:, 3] > 0
+        rays = tuple(jnp.asarray(ray) for ray in self._rays)
+        geom_id, distance = raycast.nearest(self._groups, maps, visible, rays, self._near, self._far)
+        hit = geom_id >= 0
+        # Where nothing is hit any finite point will do, but infinity would turn into NaN in the gradients.
+        point = tuple(jnp.where(hit, distance, 1.0) * ray for ray in rays)
+        winner = jnp.maximum(geom_id, 0)
+        normal = raycast.normals(self._groups, maps, winner, point)
+
+        rgba, made_of = scene.geom_rgba[winner], jnp.asarray(self._materials)[winner]
+        material = shade.Material(tuple(rgba[:, i] for i in range(3)), *(made_of[:, i] for i in range(3)))
+        color = shade.emitted(material)
+        for casts, lights in self._lights(scene).items():
+            shadow = partial(self._in_shadow, maps, visible, point) if casts else None
+            added = shade.reflected(lights, material, point, normal, shadow)
+            color = tuple(before + more for before, more in zip(color, added, strict=True))
+
+        shape = (self.height, self.width)
+        return Frame(
+            color=jnp.stack([jnp.where(hit, jnp.clip(c, 0.0, 1.0), 0.0).reshape(shape) for c in color], axis=-1),
+            depth=distance.reshape(shape),
+            geom_id=geom_id.reshape(shape),
+        )
+
+    def _in_shadow(self, maps, visible, point, path, w) -> jax.Array:
+        """Whether a geom stands between the points and a light: [P] bool."""
+        path = jax.lax.stop_gradient(path)
+        return raycast.blocked(self._groups, maps, visible, point, path, jnp.where(w > 0, 1.0, self._far))
+
+    def _lights(self, scene: Scene) -> dict[bool, shade.Lights]:
+        """The lights in the camera frame, by whether they throw shadows; the headlight is the last of those without."""
+        model = self._model
+        to_camera = jax.lax.stop_gradient(scene.cam_xmat).T
+        directional = (model.light_type == _DIRECTIONAL)[:, None]
+        spot = (model.light_type == _SPOT) & (model.light_cutoff < 180)
+        direction = _rotate(to_camera, scene.light_xdir)
+        direction = direction / jnp.maximum(jnp.linalg.norm(direction, axis=1, keepdims=True), 1e-6)
+        position = _rotate(to_camera, scene.light_xpos - jax.lax.stop_gradient(scene.cam_xpos))
+        lights = shade.Lights(
+            ambient=scene.light_ambient,
+            diffuse=scene.light_diffuse,
+            specular=scene.light_specular,
+            direction=direction,
+            position=jnp.concatenate([jnp.where(directional, -direction, position), ~directional], axis=1),
+            attenuation=jnp.where(directional, jnp.array([1.0, 0.0, 0.0]), model.light_attenuation),
+            cutoff=jnp.where(spot, np.cos(np.deg2rad(model.light_cutoff)), -2.0),
+            exponent=jnp.where(spot, model.light_exponent, 0.0),
+        )
+        ambient, diffuse, specular = scene.headlight[:, None]
+        ahead = jnp.array([[0.0, 0.0, -1.0]])
+        behind = jnp.array([[0.0, 0.0, 1.0, 0.0]])
+        plain = jnp.array([[1.0, 0.0, 0.0]])
+        headlight = shade.Lights(ambient, diffuse, specular, ahead, behind, plain, jnp.array([-2.0]), jnp.array([0.0]))
+        active, casts = model.light_active.astype(bool), model.light_castshadow.astype(bool) & self._shadows
+        others = jax.tree.map(lambda a, b: jnp.concatenate([a[active & ~casts], b]), lights, headlight)
+        if not (active & casts).any():
+            return {False: others}
+        return {False: others, True: jax.tree.map(lambda a: a[active & casts], lights)}
+
+
+def _rotate(matrix: jax.Array, vector: jax.Array) -> jax.Array:
+    """Matrices [..., 3, 3] on vectors [..., 3], in full precision on every device."""
+    return jnp.einsum("...ij,...j->...i", matrix, vector, precision=jax.lax.Precision.HIGHEST)
+
+
+def _geom_rgba(model: mujoco.MjModel) -> np.ndarray:
+    """[G, 4] colours. As in MuJoCo a geom that keeps the default colour takes its material's."""
+    rgba = np.array(model.geom_rgba)
+    takes = (model.geom_matid >= 0) & np.all(rgba == np.array([0.5, 0.5, 0.5, 1.0]), axis=1)
+    rgba[takes] = model.mat_rgba[model.geom_matid[takes]]
+    return rgba
+
+
+def _materials(model: mujoco.MjModel) -> np.ndarray:
+    """[G, 3] emission, specular and shininess; without a material MuJoCo's defaults."""
+    values = np.tile(np.array([0.0, 0.5, 0.5], np.float32), (model.ngeom, 1))
+    has = model.geom_matid >= 0
+    table = np.stack([model.mat_emission, model.mat_specular, model.mat_shininess], axis=1)
+    values[has] = table[model.geom_matid[has]]
+    return values
+
+
+def _find_camera(model: mujoco.MjModel, camera: str | int) -> int:
+    """Id of a camera that this renderer can show.
+
+    Raises:
+        ValueError: there is no such camera, or it is not given by `fovy` alone.
+    """
+    names = [model.camera(i).name for i in range(model.ncam)]
+    if isinstance(camera, str) and camera in names:
+        camera = names.index(camera)
+    if isinstance(camera, str) or not 0 <= camera < model.ncam:
+        raise ValueError(f"camera={camera!r}: expected one of {names} or an id in [0, {model.ncam})")
+    if int(model.cam_projection[camera]) != int(mujoco.mjtProjection.mjPROJ_PERSPECTIVE):
+        raise ValueError(f"cam_projection={model.cam_projection[camera]} of camera {camera}: expected perspective")
+    if model.cam_sensorsize[camera].any():
+        raise ValueError(f"cam_sensorsize={model.cam_sensorsize[camera]} of camera {camera}: expected none, but fovy")
+    return camera
+
+
+def _group_geoms(model: mujoco.MjModel) -> dict[raycast.Kind, np.ndarray]:
+    """Ids of the shown geoms by kind, the largest group last as `raycast.nearest` prefers.
+
+    Raises:
+        ValueError: a shown geom is no primitive, or no geom is shown.
+    """
+    kinds: dict[raycast.Kind, list[int]] = {}
+    for i in np.flatnonzero(model.geom_group < _SHOWN_GROUPS):
+        geom_type = int(model.geom_type[i])
+        if geom_type not in raycast.KIND_OF_GEOM:
+            name = mujoco.mjtGeom(geom_type).name
+            raise ValueError(
+                f"geom_type={name} of geom {i} {model.geom(i).name!r}: expected a plane, sphere, capsule, ellipsoid, "
+                f"cylinder or box, or a geom_group of {_SHOWN_GROUPS} or more, which is not shown"
+            )
+        kinds.setdefault(raycast.KIND_OF_GEOM[geom_type], []).append(int(i))
+    if not kinds:
+        raise ValueError(f"geom_group={model.geom_group}: expected a geom in a group below {_SHOWN_GROUPS}")
+    return {kind: np.array(kinds[kind]) for kind in sorted(kinds, key=lambda kind: len(kinds[kind]))}
+
+
+def _check_lights(model: mujoco.MjModel) -> None:
+    """Refuses what the shading does not cover.
+
+    Raises:
+        ValueError: an image light, or a light that tracks a body instead of being fixed to its own.
+    """
+    for i in range(model.nlight):
+        if int(model.light_type[i]) == int(mujoco.mjtLightType.mjLIGHT_IMAGE):
+            raise ValueError(f"light_type=mjLIGHT_IMAGE of light {i}: expected spot, directional or point")
+        if int(model.light_mode[i]) != int(mujoco.mjtCamLight.mjCAMLIGHT_FIXED):
+            mode = mujoco.mjtCamLight(int(model.light_mode[i])).name
+            raise ValueError(f"light_mode={mode} of light {i}: expected mjCAMLIGHT_FIXED")

@@ -1,0 +1,60 @@
+"""Plots and videos of a run."""
+
+import json
+import pathlib
+from typing import Any
+
+import imageio.v3 as iio
+import matplotlib
+import numpy as np
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt  # noqa: E402
+
+
+def read_metrics(path: pathlib.Path) -> list[dict[str, Any]]:
+    """The lines of a metrics.jsonl file."""
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def learning_curve(metrics: list[dict[str, Any]], evaluation: dict[str, Any], path: pathlib.Path) -> None:
+    """Plots the meta-objective and the validation success over the steps, with floors, ceiling and test result.
+
+    Args:
+        metrics: lines with "step" and "loss" or "validation_success".
+        evaluation: the run's evaluation.json.
+        path: image file to write.
+    """
+    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
+    losses = [(line["step"], line["loss"]) for line in metrics if "loss" in line]
+    left.plot(*zip(*losses, strict=True), color="tab:blue", lw=1)
+    left.set(xlabel="meta-updates", ylabel="loss after adaptation", yscale="log")
+    valid = [(line["step"], line["validation_success"]) for line in metrics if "validation_success" in line]
+    right.plot(*zip(*valid, strict=True), "o-", color="tab:blue", label="validation")
+    low, high = evaluation["wilson95"]
+    success = evaluation["success"]
+    last = valid[-1][0]
+    error = [[success - low], [high - success]]
+    right.errorbar([last], [success], error, fmt="s", color="black", label="test, 95%")
+    for (name, value), color in zip(evaluation["baselines"].items(), ("0.6", "tab:orange", "tab:green"), strict=False):
+        right.axhline(value, color=color, ls="--", lw=1, label=name.replace("_", "-"))
+    right.set(xlabel="meta-updates", ylabel="success", ylim=(0, 1.02))
+    right.legend(fontsize=8)
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
+
+
+def side_by_side(demo: np.ndarray, trial: np.ndarray, path: pathlib.Path, fps: int = 20) -> None:
+    """Writes an animation: the demonstration on the left, the policy on the right.
+
+    Args:
+        demo: [M, T, H, W, 3] uint8, M demonstrations.
+        trial: [M, T, H, W, 3] uint8, the policy's rollouts on the same tasks.
+        path: a .gif file.
+        fps: frames per second.
+    """
+    gap = np.full((*demo.shape[1:3], 8, 3), 255, np.uint8)
+    clips = [np.concatenate([left, gap, right], axis=2) for left, right in zip(demo, trial, strict=True)]
+    # The last frame stays for half a second before the next task begins.
+    frames = np.concatenate([np.concatenate([clip, np.repeat(clip[-1:], fps // 2, axis=0)]) for clip in clips])
+    iio.imwrite(path, frames, extension=".gif", duration=1000 / fps, loop=0)

@@ -1,0 +1,264 @@
+"""One run, from nothing to an evaluated policy, in one folder; started again, it continues where it stopped.
+
+config.json             the configuration
+demos/*.npz             expert demonstrations of each split
+checkpoints/            the latest and the best by validation success
+metrics.jsonl           one line for every log and validation; events.* hold the same for TensorBoard
+evaluation.json         success on held-out tasks, with floors and ceiling
+learning_curve.png, rollouts.gif
+"""
+
+import contextlib
+import json
+import pathlib
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from tensorboardX import SummaryWriter
+
+from milx import config as config_lib
+from milx import envs, evaluator, methods, provenance, report, whitening
+from milx.checkpoint import Checkpoints
+from milx.config import Config
+from milx.data import demos as demos_lib
+from milx.data.demos import DemoSet
+from milx.policy import params_like, spec_of
+from milx.trainer import Trainer, TrainState, make_optimizer
+from milx.trajopt.ilqr import Options
+from milx.types import Params
+
+EVALUATION_SEED = 2017
+"""Validation and test tasks and their trials are the same for every seed of a run."""
+_SPLIT_KEYS = {"train": 0, "validation": 1, "test": 2}
+
+
+class Run:
+    """A run's folder, environment and method.
+
+    Args:
+        config: what to run.
+        workdir: the folder; made if missing.
+        console: where to report progress.
+
+    Raises:
+        ValueError: if the folder holds a run of another configuration; the message shows the difference.
+    """
+
+    def __init__(self, config: Config, workdir: str | pathlib.Path, console: Console | None = None):
+        self.config = config
+        self.folder = pathlib.Path(workdir)
+        self.console = console or Console()
+        self.env = envs.make(config.env_name, config.env.image_shape)
+        self.method = methods.make(config, spec_of(self.env))
+        self.trainer = Trainer(
+            self.env, self.method, config.train, make_optimizer(config.optimizer, config.train.steps)
+        )
+        self.planner = Options(iterations=config.data.plan_iterations)
+        self.seconds = {"demos": 0.0, "compile": 0.0, "train": 0.0, "evaluate": 0.0}
+        self._claim_folder()
+
+    def train(self) -> None:
+        """Meta-trains to the configured number of steps, from the latest checkpoint if there is one."""
+        config = self.config.train
+        train, validation = self.demos("train"), self.demos("validation")
+        checkpoints = Checkpoints(self.folder / "checkpoints")
+        state, key = self._start(train, checkpoints)
+        with self._clock("compile"):
+            lowered = Trainer.run.lower(self.trainer, state, train, key, config.log_every)
+            run_steps = lowered.compile()
+        metrics = MetricsWriter(self.folder, int(state.step))
+        with self._progress(config.steps) as progress:
+            bar = progress.add_task(
+                "meta-train", total=config.steps, completed=int(state.step), loss=float("nan"), rate=0
+            )
+            while (step := int(state.step)) < config.steps:
+                began = time.perf_counter()
+                with self._clock("train"):
+                    state, values = run_steps(state, train, key)
+                    values = {name: float(value) for name, value in values.items()}
+                rate = config.log_every / (time.perf_counter() - began)
+                step += config.log_every
+                metrics.write(step, {**values, "steps_per_s": rate})
+                progress.update(bar, completed=step, loss=values["loss"], rate=rate)
+                if step % config.eval_every == 0 or step >= config.steps:
+                    success = self._validate(state.params, validation)
+                    metrics.write(step, {"validation_success": success})
+                    progress.console.print(f"step {step}: validation success {success:.1%}")
+                    items = {"params": state.params, "trainer": (state.step, state.optimizer)}
+                    checkpoints.save(step, items, success, self.seconds)
+        metrics.close()
+        checkpoints.close()
+
+    def evaluate(self) -> dict[str, Any]:
+        """Evaluates the best checkpoint on the test tasks; writes and returns evaluation.json, with plot and video."""
+        checkpoints = Checkpoints(self.folder / "checkpoints", read_only=True)
+        step = checkpoints.best
+        if step is None:
+            raise ValueError(f"workdir: {self.folder} has no checkpoint yet; train first")
+        items, self.seconds = checkpoints.restore(step, {"params": params_like(self.method, spec_of(self.env))})
+        if checkpoints.latest not in (None, step):
+            _, self.seconds = checkpoints.restore(checkpoints.latest, {})
+        config, test = self.config.evaluation, self.demos("test")
+        key = jax.random.key(EVALUATION_SEED + _SPLIT_KEYS["test"])
+        with self._clock("evaluate"):
+            table = evaluator.success_table(self.env, self.method, items["params"], test, config, key)
+            floors = evaluator.baselines(self.env, test, config, key, self.planner)
+        result = self._result(evaluator.summary(table), floors, step)
+        (self.folder / "evaluation.json").write_text(json.dumps(result, indent=1) + "\n")
+        report.learning_curve(
+            report.read_metrics(self.folder / "metrics.jsonl"), result, self.folder / "learning_curve.png"
+        )
+        self._film(items["params"], test, key)
+        return result
+
+    def report(self, result: dict[str, Any]) -> None:
+        """Prints a result of `evaluate`."""
+        low, high = result["wilson95"]
+        floors = ", ".join(f"{name.replace('_', '-')} {value:.1%}" for name, value in result["baselines"].items())
+        self.console.print(
+            f"[bold]{result['success']:.1%}[/bold] of {result['trials']} trials on held-out tasks succeed "
+            f"(95% interval {low:.1%} to {high:.1%}; {floors}). {result['wall_clock_s']['total']:.0f} s in all. "
+            f"See {self.folder}"
+        )
+
+    def demos(self, split: str) -> DemoSet:
+        """The demonstrations of a split: read from the folder, or planned and written there."""
+        data, evaluation = self.config.data, self.config.evaluation
+        num_tasks, num_demos = {
+            "train": (data.tasks, data.demos_per_task),
+            "validation": (evaluation.validation_tasks, evaluation.shots),
+            "test": (evaluation.tasks, evaluation.shots),
+        }[split]
+        seed = self.config.seed if split == "train" else EVALUATION_SEED
+        key = jax.random.fold_in(jax.random.key(seed), _SPLIT_KEYS[split])
+
+        def collect() -> DemoSet:
+            return demos_lib.collect(
+                self.env, key, split, num_tasks, num_demos, data.noise, self.planner, data.plan_batch
+            )
+
+        path = self.folder / "demos" / f"{split}.npz"
+        with self._clock("demos"):
+            if path.is_file():
+                return demos_lib.load(path, like=demos_lib.shapes(self.env, num_tasks, num_demos))
+            with self.console.status(f"planning {num_tasks * num_demos} {split} demonstrations"):
+                demos = jax.block_until_ready(collect())
+            demos_lib.save(path, demos)
+        reached = float(demos.success.mean())
+        self.console.print(f"{num_tasks * num_demos} {split} demonstrations, {reached:.1%} reach the goal")
+        return demos
+
+    def _start(self, train: DemoSet, checkpoints: Checkpoints) -> tuple[TrainState, jax.Array]:
+        """The state to train from, and the key of the batches."""
+        init_key, batch_key = jax.random.split(jax.random.fold_in(jax.random.key(self.config.seed), 3))
+        seen = jax.jit(jax.vmap(jax.vmap(jax.vmap(self.env.robot_state))))(train.states)
+        statistics = whitening.fit(seen, train.action, self.config.mil.whiten_actions)
+        state = self.trainer.init(init_key, statistics)
+        if checkpoints.latest is not None:
+            like = {"params": state.params, "trainer": (state.step, state.optimizer)}
+            items, self.seconds = checkpoints.restore(checkpoints.latest, like)
+            step, optimizer = items["trainer"]
+            state = TrainState(step, items["params"], optimizer)
+            self.console.print(f"continuing from step {int(step)}")
+        return state, batch_key
+
+    def _validate(self, params: Params, validation: DemoSet) -> float:
+        key = jax.random.key(EVALUATION_SEED + _SPLIT_KEYS["validation"])
+        with self._clock("evaluate"):
+            table = evaluator.success_table(self.env, self.method, params, validation, self.config.evaluation, key)
+            return float(table.mean())
+
+    def _film(self, params: Params, test: DemoSet, key: jax.Array, num_tasks: int = 3) -> None:
+        """Writes the video: demonstrations beside the policy's rollouts on the same held-out tasks, in large."""
+        height, width = self.env.image_shape
+        scale = max(1, 256 // height)
+        camera = envs.make(self.config.env_name, (scale * height, scale * width))
+        few = jax.tree.map(lambda x: x[:num_tasks], test)
+        demo, trial = evaluator.film(self.env, camera, self.method, params, few, key)
+        report.side_by_side(demo, trial, self.folder / "rollouts.gif")
+
+    def _result(self, summary: dict[str, Any], floors: dict[str, float], step: int) -> dict[str, Any]:
+        config = self.config
+        return {
+            "env": config.env_name,
+            "method": config.method_name,
+            "preset": config.preset,
+            "variant": "",
+            "seed": config.seed,
+            "num_tasks_train": config.data.tasks,
+            "num_demos_train": config.data.tasks * config.data.demos_per_task,
+            "shots": config.evaluation.shots,
+            "given": "video+state+action",
+            **summary,
+            "criterion": self.env.criterion,
+            "baselines": floors,
+            "wall_clock_s": {**self.seconds, "total": sum(self.seconds.values())},
+            "steps": step,
+            "config": config_lib.to_dict(config),
+            "dataset_hash": demos_lib.fingerprint(self.demos("train")),
+            **provenance.describe(),
+        }
+
+    def _claim_folder(self) -> None:
+        """Writes the configuration, or checks that the folder's is the same."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        path = self.folder / "config.json"
+        mine = config_lib.to_dict(self.config)
+        if path.is_file():
+            theirs = config_lib.to_dict(config_lib.from_dict(json.loads(path.read_text())))
+            changed = config_lib.differences(theirs, mine)
+            if changed:
+                raise ValueError(f"workdir: {self.folder} holds another run: {'; '.join(changed)}")
+        else:
+            path.write_text(json.dumps(mine, indent=1) + "\n")
+
+    @contextlib.contextmanager
+    def _clock(self, name: str) -> Iterator[None]:
+        """Adds the time spent to `seconds[name]`."""
+        began = time.perf_counter()
+        yield
+        self.seconds[name] += time.perf_counter() - began
+
+    def _progress(self, steps: int) -> Progress:
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("loss {task.fields[loss]:.4f}  {task.fields[rate]:.1f} steps/s"),
+            TimeRemainingColumn(),
+        )
+        return Progress(*columns, console=self.console)
+
+
+class MetricsWriter:
+    """Writes numbers to metrics.jsonl and to TensorBoard events.
+
+    Args:
+        folder: the run's.
+        step: where the run continues; lines after it are from before an interruption and are dropped.
+    """
+
+    def __init__(self, folder: pathlib.Path, step: int):
+        path = folder / "metrics.jsonl"
+        lines = [line for line in report.read_metrics(path) if line["step"] <= step] if path.is_file() else []
+        partial = path.with_suffix(".partial")
+        partial.write_text("".join(json.dumps(line) + "\n" for line in lines))
+        partial.replace(path)
+        self._file = path.open("a", buffering=1)
+        self._events = SummaryWriter(str(folder), purge_step=step + 1)
+
+    def write(self, step: int, values: dict[str, float]) -> None:
+        """Writes one line."""
+        self._file.write(json.dumps({"step": step, **values}) + "\n")
+        for name, value in values.items():
+            self._events.add_scalar(name, value, step)
+
+    def close(self) -> None:
+        """Flushes and closes both."""
+        self._file.close()
+        self._events.close()

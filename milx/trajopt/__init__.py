@@ -1,0 +1,1 @@
+"""Trajectory optimisation: the planner that demonstrates the tasks."""

@@ -1,0 +1,59 @@
+"""Experts: plan every scene once by iLQR, then run the plan's feedback with noise on the actions.
+
+The noise drives the arm off the plan and the recorded action is the feedback's answer, before the noise: a
+demonstration so shows how to recover, and its labels are clean (DART, Laskey et al. 2017).
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+
+from milx.envs.base import Env, State, Task
+from milx.trajopt.ilqr import Options, Plan, Problem, solve
+
+
+def plan(env: Env, task: Task, state: State, options: Options) -> Plan:
+    """Plans one episode from `state`: iLQR on the environment's costs, started from zero actions."""
+    low, high = env.action_range
+    problem = Problem(
+        dynamics=lambda x, u: env.step(task, state.with_vector(x), u).vector,
+        running_residual=lambda x, u, t: env.running_residual(task, state.with_vector(x), u, t),
+        terminal_residual=lambda x: env.terminal_residual(task, state.with_vector(x)),
+        control_low=low,
+        control_high=high,
+    )
+    return solve(problem, state.vector, jnp.zeros((env.horizon, env.action_size)), options)
+
+
+def demonstrate(
+    env: Env, task: Task, state: State, expert: Plan, key: jax.Array, noise: float
+) -> tuple[State, jax.Array]:
+    """Runs the plan's feedback from `state` with Gaussian noise of standard deviation `noise` on the actions.
+
+    Returns:
+        The states, with a leading axis T + 1, and the feedback's noiseless actions [T, A].
+    """
+    low, high = env.action_range
+
+    def step(state: State, inputs: tuple) -> tuple[State, tuple[State, jax.Array]]:
+        nominal_state, nominal_action, gain, key = inputs
+        action = jnp.clip(nominal_action + gain @ (state.vector - nominal_state), low, high)
+        after = env.step(task, state, action + noise * jax.random.normal(key, action.shape))
+        return after, (state, action)
+
+    keys = jax.random.split(key, env.horizon)
+    last, (states, actions) = jax.lax.scan(step, state, (expert.states[:-1], expert.actions, expert.gains, keys))
+    return jax.tree.map(lambda xs, x: jnp.concatenate([xs, x[None]]), states, last), actions
+
+
+@functools.partial(jax.jit, static_argnums=(0, 4))
+def perform(
+    env: Env, task: Task, state: State, key: jax.Array, options: Options, noise: float
+) -> tuple[State, jax.Array]:
+    """Plans and demonstrates a batch: `task`, `state` and `key` have a leading axis; so have the results."""
+
+    def one(task: Task, state: State, key: jax.Array) -> tuple[State, jax.Array]:
+        return demonstrate(env, task, state, plan(env, task, state, options), key, noise)
+
+    return jax.vmap(one)(task, state, key)

@@ -1,0 +1,66 @@
+"""The records that flow through milx, their shapes said once.
+
+Letters used in shapes throughout the project:
+    `N` tasks, `K` demonstrations of a task (shots), `T` time steps, `H`, `W` image height and width,
+    `S` size of the robot's state, `A` size of an action, `O` objects.
+"""
+
+import dataclasses
+from typing import Any
+
+import jax
+
+Params = Any
+"""A pytree of arrays: what a method learns, or what it has adapted to one task."""
+
+Memory = Any
+"""A pytree of arrays that a policy carries from one time step to the next; `()` if it carries none."""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Observation:
+    """What a policy sees at one time step (any leading axes may stand in front).
+
+    Attributes:
+        image: [H, W, 3] uint8, RGB; None where the policy sees no pixels.
+        state: [S] float32, the robot's own state in its natural units.
+    """
+
+    image: jax.Array | None = None
+    state: jax.Array | None = None
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Demo:
+    """One demonstration, or several with leading axes such as `[N, K]`.
+
+    Attributes:
+        image: [T, H, W, 3] uint8, RGB.
+        state: [T, S] float32; None when the demonstration has no states.
+        action: [T, A] float32; None when the demonstration has no actions.
+    """
+
+    image: jax.Array | None = None
+    state: jax.Array | None = None
+    action: jax.Array | None = None
+
+    @property
+    def observation(self) -> Observation:
+        """The images and states as a batch of observations."""
+        return Observation(image=self.image, state=self.state)
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class TaskBatch:
+    """A meta-batch: what every task is learnt from, and what the adapted policy must then imitate.
+
+    Attributes:
+        support: demonstrations with axes [N, K, T, ...].
+        query: other demonstrations of the same tasks, with axes [N, Q, T, ...].
+    """
+
+    support: Demo
+    query: Demo

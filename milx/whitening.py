@@ -1,0 +1,55 @@
+"""Whitening of states and actions with statistics of the training tasks only."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+
+MIN_STD = 1e-3
+"""Entries that hardly vary are divided by this and no less (as the paper's released code does)."""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Whitening:
+    """Means and scales of what a policy sees and does.
+
+    Attributes:
+        state_mean: [S].
+        state_scale: [S], at least MIN_STD.
+        action_mean: [A].
+        action_scale: [A], at least MIN_STD.
+    """
+
+    state_mean: jax.Array
+    state_scale: jax.Array
+    action_mean: jax.Array
+    action_scale: jax.Array
+
+    def state(self, state: jax.Array) -> jax.Array:
+        """Whitens states [..., S]."""
+        return (state - self.state_mean) / self.state_scale
+
+    def action(self, action: jax.Array) -> jax.Array:
+        """Whitens actions [..., A]."""
+        return (action - self.action_mean) / self.action_scale
+
+    def unwhiten_action(self, action: jax.Array) -> jax.Array:
+        """The inverse of `action`."""
+        return action * self.action_scale + self.action_mean
+
+
+def fit(state: jax.Array, action: jax.Array, whiten_actions: bool) -> Whitening:
+    """Statistics over all leading axes of states [..., S] and actions [..., A] of the training tasks.
+
+    With `whiten_actions` false, actions pass unchanged.
+    """
+
+    def moments(x: jax.Array) -> tuple[jax.Array, jax.Array]:
+        x = x.reshape(-1, x.shape[-1])
+        return x.mean(axis=0), jnp.maximum(x.std(axis=0), MIN_STD)
+
+    action_mean, action_scale = moments(action)
+    if not whiten_actions:
+        action_mean, action_scale = jnp.zeros_like(action_mean), jnp.ones_like(action_scale)
+    return Whitening(*moments(state), action_mean, action_scale)

@@ -1,0 +1,320 @@
+"""iLQR against a Riccati recursion, a convex solver, finite differences and its own laws."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.optimize
+
+from milx.trajopt import boxqp, ilqr
+
+SEEDS = 5
+
+
+@pytest.fixture(autouse=True, scope="module")
+def float64():
+    with jax.enable_x64(True):
+        yield
+
+
+# Linear dynamics and quadratic cost. Every quantity below has an independent answer.
+
+
+def random_lq(seed, T=15, n=4, m=2):
+    """A random linear system, stable so that limits leave it controllable, that has to follow a random reference."""
+    rng = np.random.default_rng(seed)
+    A = np.eye(n) + 0.3 * rng.standard_normal((n, n))
+    return {
+        "A": 0.95 * A / np.abs(np.linalg.eigvals(A)).max(),
+        "B": rng.standard_normal((n, m)),
+        "S": rng.standard_normal((n, n)),
+        "R": np.eye(m) + 0.1 * rng.standard_normal((m, m)),
+        "reference": rng.standard_normal((T, n)),
+        "S_T": 2.0 * rng.standard_normal((n, n)),
+        "x_0": 2.0 * rng.standard_normal(n),
+        "guess": rng.standard_normal((T, m)),
+    }
+
+
+def lq_problem(lq, limit):
+    return ilqr.Problem(
+        dynamics=lambda x, u: lq["A"] @ x + lq["B"] @ u,
+        running_residual=lambda x, u, t: jnp.concatenate([lq["S"] @ (x - lq["reference"][t]), lq["R"] @ u]),
+        terminal_residual=lambda x: lq["S_T"] @ x,
+        control_low=jnp.full(lq["B"].shape[1], -limit),
+        control_high=jnp.full(lq["B"].shape[1], limit),
+    )
+
+
+def riccati(lq):
+    """The discrete Riccati recursion of the tracking problem: states, actions and gains."""
+    A, B, R, Q = lq["A"], lq["B"], lq["R"].T @ lq["R"], lq["S"].T @ lq["S"]
+    P, p = lq["S_T"].T @ lq["S_T"], np.zeros(len(A))
+    K, k = [], []
+    for reference in lq["reference"][::-1]:
+        K.insert(0, -np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A))
+        k.insert(0, -np.linalg.solve(R + B.T @ P @ B, B.T @ p))
+        F = A + B @ K[0]
+        P, p = Q + A.T @ P @ F, F.T @ p - Q @ reference
+    states, actions = [lq["x_0"]], []
+    for K_t, k_t in zip(K, k, strict=True):
+        actions.append(K_t @ states[-1] + k_t)
+        states.append(A @ states[-1] + B @ actions[-1])
+    return np.stack(states), np.stack(actions), np.stack(K)
+
+
+def bounded_least_squares(lq, limit):
+    """The optimal actions under limits, from SciPy: the residuals of the whole problem are M u + c in the actions."""
+    T, m = lq["guess"].shape
+
+    def residuals(actions):
+        x, parts = lq["x_0"], []
+        for u, reference in zip(actions.reshape(T, m), lq["reference"], strict=True):
+            parts += [lq["S"] @ (x - reference), lq["R"] @ u]
+            x = lq["A"] @ x + lq["B"] @ u
+        return np.concatenate([*parts, lq["S_T"] @ x])
+
+    c = residuals(np.zeros(T * m))
+    M = np.stack([residuals(e) - c for e in np.eye(T * m)], axis=1)
+    solution = scipy.optimize.lsq_linear(M, -c, (-limit, limit), method="bvls", tol=1e-14)
+    assert solution.success
+    gradient = (M.T @ (M @ solution.x + c)).reshape(T, m)
+    return solution.x.reshape(T, m), solution.cost, gradient
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def solve_lq(lq, limit, options):
+    return jax.vmap(lambda lq: ilqr.solve(lq_problem(lq, limit), lq["x_0"], lq["guess"], options))(lq)
+
+
+@pytest.fixture(scope="module")
+def lqs():
+    return [random_lq(seed) for seed in range(SEEDS)]
+
+
+@pytest.fixture(scope="module")
+def stacked_lqs(lqs):
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *lqs)
+
+
+def test_one_iteration_solves_lq_as_riccati_does(lqs, stacked_lqs):
+    plans = solve_lq(stacked_lqs, np.inf, ilqr.Options(regularisation=0.0))
+    np.testing.assert_array_equal(plans.iterations, 1)
+    assert plans.converged.all()
+    for i, lq in enumerate(lqs):
+        states, actions, gains = riccati(lq)
+        np.testing.assert_allclose(plans.states[i], states, atol=1e-9)
+        np.testing.assert_allclose(plans.actions[i], actions, atol=1e-9)
+        np.testing.assert_allclose(plans.gains[i], gains, atol=1e-9)
+
+
+def test_expected_change_of_lq_is_exact(lqs):
+    # Whatever μ and α are: μ changes the policy, and the expected change is that of the policy found.
+    lq = jax.tree.map(jnp.asarray, lqs[0])
+    problem = lq_problem(lq, np.inf)
+
+    @jax.jit
+    def change(mu, alpha):
+        idle = ilqr._Policy(jnp.zeros((15, 2)), jnp.zeros((15, 2, 4)), jnp.zeros(2))
+        start = jnp.broadcast_to(lq["x_0"], (16, 4))
+        states, actions, cost = ilqr._forward(problem, start, lq["guess"], idle, 0.0)
+        policy = ilqr._backward(problem, states, actions, mu)
+        _, _, new_cost = ilqr._forward(problem, states, actions, policy, alpha)
+        return new_cost - cost, policy.change @ jnp.array([alpha, alpha**2])
+
+    for mu, alpha in [(0.0, 1.0), (0.0, 0.3), (5.0, 1.0), (5.0, 0.1)]:
+        np.testing.assert_allclose(*change(mu, alpha), rtol=1e-9)
+
+
+def test_limited_lq_reaches_the_convex_optimum(lqs, stacked_lqs):
+    limit = 0.6
+    plans = solve_lq(stacked_lqs, limit, ilqr.Options(iterations=200, tolerance=1e-12))
+    assert plans.converged.all()
+    for i, lq in enumerate(lqs):
+        actions, cost, gradient = bounded_least_squares(lq, limit)
+        held = np.abs(gradient) > 1e-3
+        assert 0.2 < held.mean() < 0.8
+        np.testing.assert_allclose(plans.cost[i], cost, rtol=1e-9)
+        np.testing.assert_allclose(plans.actions[i], actions, atol=1e-4)
+        # No feedback where a limit holds the action back, feedback elsewhere.
+        np.testing.assert_array_equal(np.any(plans.gains[i] != 0, axis=-1), ~held)
+
+
+@pytest.mark.parametrize("m", [1, 2, 7])
+def test_box_qp_reaches_the_optimum(m):
+    rng = np.random.default_rng(m)
+    L = np.tril(rng.standard_normal((50, m, m))) + 2 * np.eye(m)
+    H, g = L @ L.transpose(0, 2, 1), 5 * rng.standard_normal((50, m))
+    low, high = -rng.uniform(0, 1, (50, m)), rng.uniform(0, 1, (50, m))
+    solve = jax.jit(jax.vmap(functools.partial(boxqp.solve, iterations=20)))
+    found, free = solve(H, g, low, high, np.zeros_like(g))
+    for i in range(50):
+        # ½ xᵀHx + gᵀx is ½ |Lᵀx + L⁻¹g|² up to a constant.
+        best = scipy.optimize.lsq_linear(L[i].T, -np.linalg.solve(L[i], g[i]), (low[i], high[i]), method="bvls")
+        np.testing.assert_allclose(found[i], best.x, atol=1e-7)
+        np.testing.assert_array_equal(free[i], best.active_mask == 0)
+
+
+# The swing-up of a pendulum: nonlinear, with limits too weak to lift it at once.
+
+T, H, LIMIT = 60, 0.05, 4.0
+
+
+def pendulum(x, u):
+    """Semi-implicit Euler; the angle is zero upright, gravity 9.81, mass and length 1."""
+    angle, velocity = x
+    velocity = velocity + H * (9.81 * jnp.sin(angle) - 0.05 * velocity + u[0])
+    return jnp.stack([angle + H * velocity, velocity])
+
+
+def upright(x):
+    return jnp.stack([jnp.sin(x[0]), 1 - jnp.cos(x[0]), 0.3 * x[1]])
+
+
+def pendulum_problem(dynamics=pendulum):
+    return ilqr.Problem(
+        dynamics=dynamics,
+        running_residual=lambda x, u, t: jnp.concatenate([0.1 * upright(x), 0.05 * u]),
+        terminal_residual=lambda x: 10 * upright(x),
+        control_low=jnp.array([-LIMIT]),
+        control_high=jnp.array([LIMIT]),
+    )
+
+
+GUESS = np.sin(0.3 * np.arange(T))[:, None]
+STARTS = np.array([[np.pi, 0.0], [2.0, 1.0], [-3.0, 0.5], [0.3, 0.0]])
+
+
+def rollout_cost(actions, start, gains=None, states=None):
+    """J by an independent rollout in NumPy, open-loop or with feedback."""
+    x, cost = np.array(start), 0.0
+    residual = lambda x: np.array([np.sin(x[0]), 1 - np.cos(x[0]), 0.3 * x[1]])  # noqa: E731
+    for t, u in enumerate(np.asarray(actions)):
+        if gains is not None:
+            u = np.clip(u + gains[t] @ (x - states[t]), -LIMIT, LIMIT)
+        cost += 0.5 * (np.sum((0.1 * residual(x)) ** 2) + np.sum((0.05 * u) ** 2))
+        velocity = x[1] + H * (9.81 * np.sin(x[0]) - 0.05 * x[1] + u[0])
+        x = np.array([x[0] + H * velocity, velocity])
+    return cost + 0.5 * np.sum((10 * residual(x)) ** 2)
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def solve_pendulum(start, options=None):
+    return ilqr.solve(pendulum_problem(), start, jnp.asarray(GUESS, start.dtype), options)
+
+
+@pytest.fixture(scope="module")
+def swing_ups():
+    options = ilqr.Options(iterations=300, tolerance=1e-13)
+    return [solve_pendulum(jnp.asarray(start), options) for start in STARTS]
+
+
+def test_cost_never_rises():
+    def cost_after(iterations):
+        options = ilqr.Options(iterations=iterations)
+        return ilqr.solve(pendulum_problem(), jnp.asarray(STARTS[0]), jnp.asarray(GUESS), options).cost
+
+    costs = np.asarray(jax.jit(jax.vmap(cost_after))(jnp.arange(25)))
+    np.testing.assert_allclose(costs[0], rollout_cost(GUESS, STARTS[0]), rtol=1e-12)
+    assert np.all(np.diff(costs) <= 0)
+    assert costs[-1] < 0.05 * costs[0]
+
+
+def test_plans_are_rollouts_within_limits(swing_ups):
+    for start, plan in zip(STARTS, swing_ups, strict=True):
+        assert np.abs(plan.actions).max() <= LIMIT
+        np.testing.assert_allclose(plan.cost, rollout_cost(plan.actions, start), rtol=1e-10)
+    assert any(np.abs(plan.actions).max() == LIMIT for plan in swing_ups)
+
+
+def test_plans_are_stationary(swing_ups):
+    """Central differences of the whole cost: zero inside the limits, pushing outwards on them."""
+    epsilon = 1e-5
+    for start, plan in zip(STARTS, swing_ups, strict=True):
+        assert plan.converged
+        actions = np.asarray(plan.actions)
+
+        def gradient(actions, start=start):
+            steps = epsilon * np.eye(T)[:, :, None]
+            return np.array([rollout_cost(actions + e, start) - rollout_cost(actions - e, start) for e in steps]) / (
+                2 * epsilon
+            )
+
+        scale = np.abs(gradient(GUESS)).max()
+        slope, actions = gradient(actions), actions[:, 0]
+        np.testing.assert_allclose(slope[np.abs(actions) < LIMIT] / scale, 0, atol=1e-5)
+        assert np.all(slope[actions == LIMIT] < 1e-5 * scale)
+        assert np.all(slope[actions == -LIMIT] > -1e-5 * scale)
+
+
+def test_expected_change_is_the_slope_of_the_line_search():
+    problem = pendulum_problem()
+
+    @jax.jit
+    def line(alphas):
+        idle = ilqr._Policy(jnp.zeros((T, 1)), jnp.zeros((T, 1, 2)), jnp.zeros(2))
+        start = jnp.broadcast_to(STARTS[1], (T + 1, 2))
+        states, actions, _ = ilqr._forward(problem, start, jnp.asarray(GUESS), idle, 0.0)
+        policy = ilqr._backward(problem, states, actions, 0.1)
+        costs = jax.vmap(lambda alpha: ilqr._forward(problem, states, actions, policy, alpha)[2])(alphas)
+        return costs, policy.change[0]
+
+    # The derivative on the side of positive α, to second order.
+    epsilon = 1e-5
+    costs, slope = line(epsilon * jnp.arange(3))
+    np.testing.assert_allclose((-3 * costs[0] + 4 * costs[1] - costs[2]) / (2 * epsilon), slope, rtol=1e-5)
+
+
+def test_feedback_recovers_from_a_push(swing_ups):
+    # The push changes the start by 0.05 rad; the optimum from there is the yardstick.
+    start = STARTS[1] + np.array([0.05, 0.0])
+    plan = swing_ups[1]
+    best = solve_pendulum(jnp.asarray(start), ilqr.Options(iterations=300, tolerance=1e-13)).cost
+    open_loop = rollout_cost(plan.actions, start) - best
+    closed_loop = rollout_cost(plan.actions, start, np.asarray(plan.gains), np.asarray(plan.states)) - best
+    assert closed_loop < 0.1 * open_loop
+
+
+def test_vmapped_solve_equals_a_loop(swing_ups):
+    options = ilqr.Options(iterations=300, tolerance=1e-13)
+    batch = jax.vmap(lambda start: solve_pendulum(start, options))(STARTS)
+    assert len(set(batch.iterations.tolist())) > 1
+    for i, plan in enumerate(swing_ups):
+        assert batch.iterations[i] == plan.iterations
+        np.testing.assert_allclose(batch.cost[i], plan.cost, rtol=1e-9)
+        np.testing.assert_allclose(batch.states[i], plan.states, atol=1e-6)
+
+
+def test_float32_reaches_the_cost_of_float64(swing_ups):
+    with jax.enable_x64(False):
+        for start, exact in zip(STARTS, swing_ups, strict=True):
+            plan = solve_pendulum(jnp.asarray(start, jnp.float32))
+            assert plan.converged
+            assert plan.cost.dtype == jnp.float32
+            np.testing.assert_allclose(plan.cost, exact.cost, rtol=1e-3)
+
+
+# Dynamics that break down beyond a speed, which the plan without the break-down exceeds.
+
+
+def test_nan_in_parts_of_the_state_space_is_avoided(swing_ups):
+    speed = 0.9 * np.abs(swing_ups[0].states[:, 1]).max()
+
+    def brittle(x, u):
+        return pendulum(x, u) + 0.0 * jnp.sqrt(speed**2 - x[1] ** 2)
+
+    plan = jax.jit(lambda start: ilqr.solve(pendulum_problem(brittle), start, jnp.asarray(GUESS)))(STARTS[0])
+    assert all(np.isfinite(leaf).all() for leaf in (plan.states, plan.actions, plan.gains, plan.cost))
+    assert np.abs(plan.states[:, 1]).max() <= speed
+    assert plan.cost < 0.5 * rollout_cost(GUESS, STARTS[0])
+
+
+def test_without_a_finite_rollout_there_is_no_plan():
+    broken = pendulum_problem(lambda x, u: pendulum(x, u) * jnp.nan)
+    plan = jax.jit(lambda start: ilqr.solve(broken, start, jnp.asarray(GUESS)))(STARTS[0])
+    assert plan.cost == np.inf
+    assert not plan.converged
+    np.testing.assert_array_equal(plan.actions, GUESS)
+    np.testing.assert_array_equal(plan.gains, 0)
