@@ -10,7 +10,7 @@ import jax.numpy as jnp
 def map_in_chunks(function: Callable[..., Any], inputs: tuple, size: int) -> Any:
     """Calls `function(*inputs)` on slices of the leading axis and joins the results.
 
-    Every call has the same size, so that one compilation serves all: the last slice repeats its final entry.
+    Every call has the same size, so that one compilation serves all: where entries lack, the last one is repeated.
 
     Args:
         function: maps pytrees with leading axis [size] to a pytree with leading axis [size].
@@ -21,7 +21,6 @@ def map_in_chunks(function: Callable[..., Any], inputs: tuple, size: int) -> Any
         The results, with leading axis [M].
     """
     total = len(jax.tree.leaves(inputs)[0])
-    size = min(size, total)
     results = []
     for start in range(0, total, size):
         index = jnp.minimum(jnp.arange(start, start + size), total - 1)

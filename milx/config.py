@@ -35,9 +35,9 @@ class DataConfig:
 
     tasks: int = 1500
     demos_per_task: int = 10
-    noise: float = 0.02
-    plan_iterations: int = 12
-    plan_batch: int = 4096
+    noise: float = 0.01
+    plan_iterations: int = 10
+    plan_batch: int = 16384
 
 
 @dataclasses.dataclass
@@ -189,7 +189,7 @@ def _reach_fast() -> Config:
 def _reach_cpu() -> Config:
     config = _reach_fast()
     config.env = EnvConfig(image_shape=(32, 40))
-    config.data = DataConfig(tasks=400, demos_per_task=6, plan_batch=400)
+    config.data = DataConfig(tasks=400, demos_per_task=6, plan_iterations=6, plan_batch=100)
     config.network.filters = (24, 24, 24)
     config.network.strides = (2, 1, 1)
     config.network.fc_layers = (100, 100)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from milx.chunks import map_in_chunks
-from milx.config import EvalConfig
+from milx.config import DataConfig, EvalConfig
 from milx.data.demos import DemoSet, render_demo
 from milx.envs.base import Env, State, Task
 from milx.methods.base import Method
@@ -80,11 +80,12 @@ def success_table(
     return map_in_chunks(functools.partial(_success, env, method, params), inputs, config.batch)
 
 
-def baselines(env: Env, demos: DemoSet, config: EvalConfig, key: jax.Array, options: Options) -> dict[str, float]:
+def baselines(env: Env, demos: DemoSet, config: EvalConfig, expert: DataConfig, key: jax.Array) -> dict[str, float]:
     """Success rates in the same trials of: random actions, the task-blind expert, and the expert.
 
     The task-blind expert goes to a random candidate; the expert runs its plan without noise.
     """
+    options = Options(iterations=expert.plan_iterations)
     scene = trial_scenes(env, demos.task, jax.random.split(key)[0], config.trials)
     task = jax.tree.map(lambda x: jnp.repeat(x, config.trials, axis=0), demos.task)
     scene = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), scene)
@@ -93,7 +94,7 @@ def baselines(env: Env, demos: DemoSet, config: EvalConfig, key: jax.Array, opti
     def expert_success(believed: Task) -> float:
         """Success at `task` of an expert who takes the task for `believed`."""
         states, _ = map_in_chunks(
-            lambda *chunk: perform(env, *chunk, options, 0.0), (believed, scene, keys), config.batch * config.trials
+            lambda *chunk: perform(env, *chunk, options, 0.0), (believed, scene, keys), expert.plan_batch
         )
         return float(jax.jit(jax.vmap(env.success))(task, states).mean())
 

@@ -6,21 +6,31 @@ import pathlib
 import jax
 import jaxlib
 
-# jaxlib before 0.11 fuses MJX's kinematic chain on the CPU by recomputing it, exponentially in the depth of the
-# chain. Turning the fusion emitters off cures it. From 0.11 on the flag is unknown, and unknown flags are fatal.
-_FUSION_FLAG = "--xla_cpu_use_fusion_emitters=false"
+# CPU flags for jaxlib before 0.11; unknown flags are fatal, so later versions must not see them.
+# - Fusion emitters fuse MJX's kinematic chain by recomputing it, exponentially in the depth of the chain.
+# - The concurrent scheduler lets two batched LAPACK calls (MJX's Cholesky) wait for each other for ever.
+_CPU_FLAGS = {
+    "xla_cpu_use_fusion_emitters": "--xla_cpu_use_fusion_emitters=false",
+    "xla_cpu_enable_concurrency_optimized_scheduler": "--xla_cpu_enable_concurrency_optimized_scheduler=false",
+}
+
+
+def cache_folder() -> pathlib.Path:
+    """The user's cache folder for milx: `$XDG_CACHE_HOME/milx`, or `~/.cache/milx`."""
+    home = os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache"
+    return pathlib.Path(home) / "milx"
 
 
 def configure() -> None:
     """Turns the persistent compilation cache on and works around slow MJX code of old CPU compilers.
 
-    The cache lives in the user's cache folder (`$XDG_CACHE_HOME/milx/jax`); `JAX_COMPILATION_CACHE_DIR` moves it.
+    The cache lives in `cache_folder() / "jax"`; `JAX_COMPILATION_CACHE_DIR` moves it.
     """
     version = tuple(int(part) for part in jaxlib.__version__.split(".")[:2])
-    flags = os.environ.get("XLA_FLAGS", "")
-    if version < (0, 11) and "xla_cpu_use_fusion_emitters" not in flags:
-        os.environ["XLA_FLAGS"] = f"{flags} {_FUSION_FLAG}".strip()
+    if version < (0, 11):
+        given = os.environ.get("XLA_FLAGS", "")
+        added = [flag for name, flag in _CPU_FLAGS.items() if name not in given]
+        os.environ["XLA_FLAGS"] = " ".join([given, *added]).strip()
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        home = os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache"
-        jax.config.update("jax_compilation_cache_dir", str(pathlib.Path(home) / "milx" / "jax"))
+        jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "jax"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)

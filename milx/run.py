@@ -22,19 +22,22 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from tensorboardX import SummaryWriter
 
 from milx import config as config_lib
-from milx import envs, evaluator, methods, provenance, report, whitening
+from milx import envs, evaluator, methods, platform, provenance, report, whitening
 from milx.checkpoint import Checkpoints
 from milx.config import Config
 from milx.data import demos as demos_lib
 from milx.data.demos import DemoSet
 from milx.policy import params_like, spec_of
 from milx.trainer import Trainer, TrainState, make_optimizer
-from milx.trajopt.ilqr import Options
 from milx.types import Params
 
 EVALUATION_SEED = 2017
 """Validation and test tasks and their trials are the same for every seed of a run."""
-_SPLIT_KEYS = {"train": 0, "validation": 1, "test": 2}
+
+
+def _trial_key(split: str) -> jax.Array:
+    """Draws the trial scenes of a split."""
+    return jax.random.fold_in(jax.random.key(EVALUATION_SEED), len(envs.SPLITS) + envs.SPLITS.index(split))
 
 
 class Run:
@@ -58,7 +61,6 @@ class Run:
         self.trainer = Trainer(
             self.env, self.method, config.train, make_optimizer(config.optimizer, config.train.steps)
         )
-        self.planner = Options(iterations=config.data.plan_iterations)
         self.seconds = {"demos": 0.0, "compile": 0.0, "train": 0.0, "evaluate": 0.0}
         self._claim_folder()
 
@@ -68,6 +70,7 @@ class Run:
         train, validation = self.demos("train"), self.demos("validation")
         checkpoints = Checkpoints(self.folder / "checkpoints")
         state, key = self._start(train, checkpoints)
+        dataset_hash = demos_lib.fingerprint(train)
         with self._clock("compile"):
             lowered = Trainer.run.lower(self.trainer, state, train, key, config.log_every)
             run_steps = lowered.compile()
@@ -90,7 +93,7 @@ class Run:
                     metrics.write(step, {"validation_success": success})
                     progress.console.print(f"step {step}: validation success {success:.1%}")
                     items = {"params": state.params, "trainer": (state.step, state.optimizer)}
-                    checkpoints.save(step, items, success, self.seconds)
+                    checkpoints.save(step, items, success, {"seconds": self.seconds, "dataset_hash": dataset_hash})
         metrics.close()
         checkpoints.close()
 
@@ -100,15 +103,15 @@ class Run:
         step = checkpoints.best
         if step is None:
             raise ValueError(f"workdir: {self.folder} has no checkpoint yet; train first")
-        items, self.seconds = checkpoints.restore(step, {"params": params_like(self.method, spec_of(self.env))})
-        if checkpoints.latest not in (None, step):
-            _, self.seconds = checkpoints.restore(checkpoints.latest, {})
+        items, _ = checkpoints.restore(step, {"params": params_like(self.method, spec_of(self.env))})
+        _, extra = checkpoints.restore(checkpoints.latest, {})
+        self.seconds = extra["seconds"]
         config, test = self.config.evaluation, self.demos("test")
-        key = jax.random.key(EVALUATION_SEED + _SPLIT_KEYS["test"])
+        key = _trial_key("test")
         with self._clock("evaluate"):
             table = evaluator.success_table(self.env, self.method, items["params"], test, config, key)
-            floors = evaluator.baselines(self.env, test, config, key, self.planner)
-        result = self._result(evaluator.summary(table), floors, step)
+            floors = evaluator.baselines(self.env, test, config, self.config.data, key)
+        result = self._result(evaluator.summary(table), floors, step, extra["dataset_hash"])
         (self.folder / "evaluation.json").write_text(json.dumps(result, indent=1) + "\n")
         report.learning_curve(
             report.read_metrics(self.folder / "metrics.jsonl"), result, self.folder / "learning_curve.png"
@@ -127,7 +130,7 @@ class Run:
         )
 
     def demos(self, split: str) -> DemoSet:
-        """The demonstrations of a split: read from the folder, or planned and written there."""
+        """The demonstrations of a split, planned or from the cache of earlier runs."""
         data, evaluation = self.config.data, self.config.evaluation
         num_tasks, num_demos = {
             "train": (data.tasks, data.demos_per_task),
@@ -135,22 +138,11 @@ class Run:
             "test": (evaluation.tasks, evaluation.shots),
         }[split]
         seed = self.config.seed if split == "train" else EVALUATION_SEED
-        key = jax.random.fold_in(jax.random.key(seed), _SPLIT_KEYS[split])
-
-        def collect() -> DemoSet:
-            return demos_lib.collect(
-                self.env, key, split, num_tasks, num_demos, data.noise, self.planner, data.plan_batch
-            )
-
-        path = self.folder / "demos" / f"{split}.npz"
-        with self._clock("demos"):
-            if path.is_file():
-                return demos_lib.load(path, like=demos_lib.shapes(self.env, num_tasks, num_demos))
-            with self.console.status(f"planning {num_tasks * num_demos} {split} demonstrations"):
-                demos = jax.block_until_ready(collect())
-            demos_lib.save(path, demos)
-        reached = float(demos.success.mean())
-        self.console.print(f"{num_tasks * num_demos} {split} demonstrations, {reached:.1%} reach the goal")
+        what = f"{num_tasks * num_demos} {split} demonstrations"
+        with self._clock("demos"), self.console.status(f"planning {what}"):
+            folder = platform.cache_folder() / "demos"
+            demos = demos_lib.cached(folder, self.env, seed, split, num_tasks, num_demos, data)
+        self.console.print(f"{what}, of which {float(demos.success.mean()):.1%} succeed")
         return demos
 
     def _start(self, train: DemoSet, checkpoints: Checkpoints) -> tuple[TrainState, jax.Array]:
@@ -161,14 +153,15 @@ class Run:
         state = self.trainer.init(init_key, statistics)
         if checkpoints.latest is not None:
             like = {"params": state.params, "trainer": (state.step, state.optimizer)}
-            items, self.seconds = checkpoints.restore(checkpoints.latest, like)
+            items, extra = checkpoints.restore(checkpoints.latest, like)
+            self.seconds = extra["seconds"]
             step, optimizer = items["trainer"]
             state = TrainState(step, items["params"], optimizer)
             self.console.print(f"continuing from step {int(step)}")
         return state, batch_key
 
     def _validate(self, params: Params, validation: DemoSet) -> float:
-        key = jax.random.key(EVALUATION_SEED + _SPLIT_KEYS["validation"])
+        key = _trial_key("validation")
         with self._clock("evaluate"):
             table = evaluator.success_table(self.env, self.method, params, validation, self.config.evaluation, key)
             return float(table.mean())
@@ -182,7 +175,9 @@ class Run:
         demo, trial = evaluator.film(self.env, camera, self.method, params, few, key)
         report.side_by_side(demo, trial, self.folder / "rollouts.gif")
 
-    def _result(self, summary: dict[str, Any], floors: dict[str, float], step: int) -> dict[str, Any]:
+    def _result(
+        self, summary: dict[str, Any], floors: dict[str, float], step: int, dataset_hash: str
+    ) -> dict[str, Any]:
         config = self.config
         return {
             "env": config.env_name,
@@ -200,7 +195,7 @@ class Run:
             "wall_clock_s": {**self.seconds, "total": sum(self.seconds.values())},
             "steps": step,
             "config": config_lib.to_dict(config),
-            "dataset_hash": demos_lib.fingerprint(self.demos("train")),
+            "dataset_hash": dataset_hash,
             **provenance.describe(),
         }
 

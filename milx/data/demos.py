@@ -2,6 +2,7 @@
 
 import dataclasses
 import hashlib
+import json
 import pathlib
 from typing import Any
 
@@ -10,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from milx.chunks import map_in_chunks
-from milx.envs.base import Env, State, Task
+from milx.config import DataConfig
+from milx.envs.base import SPLITS, Env, State, Task
 from milx.trajopt.expert import perform
 from milx.trajopt.ilqr import Options
 from milx.types import Demo, TaskBatch
@@ -44,21 +46,18 @@ class DemoSet:
         return self.action.shape[1]
 
 
-def collect(
-    env: Env, key: jax.Array, split: str, num_tasks: int, num_demos: int, noise: float, options: Options, batch: int
-) -> DemoSet:
+def collect(env: Env, key: jax.Array, split: str, num_tasks: int, num_demos: int, config: DataConfig) -> DemoSet:
     """Draws tasks of a split and plans demonstrations of each in scenes of their own.
 
     Args:
         env: the environment.
-        key: the set is a function of this key.
+        key: the set is a function of this key and the split.
         split: "train", "validation" or "test".
         num_tasks: N.
         num_demos: D.
-        noise: standard deviation of the noise on the expert's actions, in the action's units.
-        options: of the trajectory optimisation.
-        batch: demonstrations planned at once.
+        config: noise on the actions, and settings of the planner.
     """
+    key = jax.random.fold_in(key, SPLITS.index(split))
     task_key, scene_key, noise_key = jax.random.split(key, 3)
     total = num_tasks * num_demos
     tasks = jax.vmap(env.sample_task, in_axes=(0, None))(jax.random.split(task_key, num_tasks), split)
@@ -66,7 +65,10 @@ def collect(
     state = jax.vmap(env.reset)(jax.random.split(scene_key, total), each)
     inputs = (each, state, jax.random.split(noise_key, total))
 
-    states, action = map_in_chunks(lambda *chunk: perform(env, *chunk, options, noise), inputs, batch)
+    options = Options(iterations=config.plan_iterations)
+    states, action = map_in_chunks(
+        lambda *chunk: perform(env, *chunk, options, config.noise), inputs, config.plan_batch
+    )
     success = jax.jit(jax.vmap(env.success))(each, states)
     states, action, success = jax.tree.map(
         lambda x: x.reshape(num_tasks, num_demos, *x.shape[1:]), (states, action, success)
@@ -159,6 +161,26 @@ def shapes(env: Env, num_tasks: int, num_demos: int) -> DemoSet:
         expand(action, num_tasks, num_demos, env.horizon),
         expand(success, num_tasks, num_demos),
     )
+
+
+def cached(
+    folder: pathlib.Path, env: Env, seed: int, split: str, num_tasks: int, num_demos: int, config: DataConfig
+) -> DemoSet:
+    """`collect`, or what it gave before: sets are kept in `folder` under a hash of all that they depend on.
+
+    The hash covers the arguments, the kind of device, and the sources of environments and experts.
+    """
+    request = [env.name, seed, split, num_tasks, num_demos, config.noise, config.plan_iterations, jax.default_backend()]
+    digest = hashlib.sha256(json.dumps(request).encode())
+    root = pathlib.Path(__file__).parents[1]
+    for source in sorted([*root.glob("envs/**/*.py"), *root.glob("envs/**/*.xml"), *root.glob("trajopt/*.py")]):
+        digest.update(source.read_bytes())
+    path = folder / f"{env.name}-{split}-{digest.hexdigest()[:16]}.npz"
+    if path.is_file():
+        return load(path, like=shapes(env, num_tasks, num_demos))
+    demos = collect(env, jax.random.key(seed), split, num_tasks, num_demos, config)
+    save(path, demos)
+    return demos
 
 
 def leaves(demos: DemoSet) -> dict[str, Any]:

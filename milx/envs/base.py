@@ -143,12 +143,15 @@ class Env(abc.ABC):
         ctrl = jnp.clip(action, *self.action_range)
 
         # Only positions and velocities are carried: MJX's data is large, and the rest follows from them.
-        def substep(x, _):
-            data = mjx.step(self.model, self.data(state.with_vector(x)).replace(ctrl=ctrl))
-            return jnp.concatenate([data.qpos, data.qvel]), None
-
-        x, _ = jax.lax.scan(substep, state.vector, length=self.substeps)
+        x, _ = jax.lax.scan(
+            lambda x, _: (self.integrate(state.with_vector(x), ctrl), None), state.vector, length=self.substeps
+        )
         return state.with_vector(x)
+
+    def integrate(self, state: State, ctrl: jax.Array) -> jax.Array:
+        """One physics step of the model's time step: the next `state.vector`."""
+        data = mjx.step(self.model, self.data(state).replace(ctrl=ctrl))
+        return jnp.concatenate([data.qpos, data.qvel])
 
     def observe(self, task: Task, state: State) -> Observation:
         """Renders the task's scene: image [H, W, 3] uint8 and robot state [S]."""

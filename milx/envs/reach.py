@@ -21,7 +21,7 @@ LAST_STEPS = 10
 """The target must be touched in one of the last steps of the episode."""
 # Colour grids {offset, offset + 0.1, ...}^3 of the splits: disjoint, so that test and validation colours are held out.
 COLOR_OFFSETS = {"train": 0.0, "validation": 0.025, "test": 0.05}
-ACTION_COST = 1.0
+ACTION_COST = 4.0
 VELOCITY_COST = 0.02
 _CANDIDATES = 64
 
@@ -86,6 +86,21 @@ class Reach(Env):
         """[2] position of the fingertip in the plane (m) for joint angles [2]."""
         data = mjx.kinematics(self.model, self._data.replace(qpos=qpos))
         return data.site_xpos[self._fingertip, :2]
+
+    def integrate(self, state: State, ctrl: jax.Array) -> jax.Array:
+        """One Runge-Kutta step: `mjx.step`'s, but with one copy of the dynamics in the program instead of two."""
+        h, x0 = self.mj_model.opt.timestep, state.vector
+
+        def stage(carry: tuple, coefficients: jax.Array) -> tuple[tuple, None]:
+            x, slope = carry
+            ahead, weight = coefficients
+            data = mjx.forward(self.model, self.data(state.with_vector(x0 + h * ahead * slope)).replace(ctrl=ctrl))
+            slope = jnp.concatenate([data.qvel, data.qacc])
+            return (x + h * weight * slope, slope), None
+
+        tableau = jnp.array([[0, 1 / 6], [1 / 2, 1 / 3], [1 / 2, 1 / 3], [1, 1 / 6]], x0.dtype)
+        (x, _), _ = jax.lax.scan(stage, (x0, jnp.zeros_like(x0)), tableau)
+        return x
 
     def robot_state(self, state: State) -> jax.Array:
         """[8] joint angles, joint velocities, fingertip position, fingertip velocity."""

@@ -53,17 +53,18 @@ def conv2d(x: jax.Array, kernel: jax.Array, stride: int) -> jax.Array:
     return patches(x, kernel.shape[0], stride) @ kernel.reshape(-1, kernel.shape[-1])
 
 
-def spatial_soft_argmax(features: jax.Array) -> jax.Array:
+def spatial_soft_argmax(features: jax.Array, temperature: jax.Array) -> jax.Array:
     """Expected image position of every channel (Levine et al. 2016, Section 5.1).
 
     Args:
         features: [B, H, W, C].
+        temperature: [C], divides the features before the softmax.
 
     Returns:
         [B, 2 C]: x of all channels, then y, each in [-1, 1].
     """
     height, width, channels = features.shape[1:]
-    attention = jax.nn.softmax(features.reshape(-1, height * width, channels), axis=1)
+    attention = jax.nn.softmax(features.reshape(-1, height * width, channels) / temperature, axis=1)
     y, x = jnp.meshgrid(jnp.linspace(-1, 1, height), jnp.linspace(-1, 1, width), indexing="ij")
     points = [jnp.einsum("bpc,p->bc", attention, axis.ravel()) for axis in (x, y)]
     return jnp.concatenate(points, axis=-1)

@@ -7,6 +7,9 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+import os
+
+TEMP = float(os.environ.get("TEMP0", "0"))
 from milx.config import NetworkConfig
 from milx.networks.layers import ConvBlock, Dense, spatial_soft_argmax
 from milx.types import Params
@@ -49,7 +52,11 @@ class _Policy(nn.Module):
         x = image.astype(jnp.float32) / 255.0
         for filters, stride in zip(config.filters, config.strides, strict=True):
             x = ConvBlock(filters, config.kernel, stride)(x)
-        x = spatial_soft_argmax(x) if config.soft_argmax else x.reshape(len(x), -1)
+        if config.soft_argmax:
+            log_temperature = self.param("log_temperature", nn.initializers.constant(TEMP), x.shape[-1:])
+            x = spatial_soft_argmax(x, jnp.exp(log_temperature))
+        else:
+            x = x.reshape(len(x), -1)
 
         # A learned constant joins the input of the first layer: its gradient gives the layer's bias a step of its own
         # (the paper's bias transformation, Section 4.1).

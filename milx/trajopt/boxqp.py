@@ -5,7 +5,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.scipy.linalg import cho_factor, cho_solve
 
 # Fractions of the Newton step to compare, besides the one that ends at the first bound.
 _STEP_SIZES = (1.0, 0.5, 0.25, 0.1, 0.01, 0.001)
@@ -34,9 +33,18 @@ def solve_free(H: jax.Array, b: jax.Array, free: jax.Array) -> jax.Array:
     Returns:
         y, of the shape of b.
     """
-    H_free = jnp.where(free[:, None] & free, H, jnp.eye(len(H), dtype=H.dtype))
-    b_free = jnp.where(free.reshape(-1, *[1] * (b.ndim - 1)), b, 0.0)
-    return cho_solve(cho_factor(H_free, lower=True), b_free)
+    m = len(H)
+    H_free = jnp.where(free[:, None] & free, H, jnp.eye(m, dtype=H.dtype))
+    b_free = jnp.where(free[:, None], b.reshape(m, -1), 0.0)
+    # Gauss-Jordan elimination, unrolled over the m columns: a positive definite matrix needs no pivoting. Calls into
+    # LAPACK from inside a batched loop can block each other for ever on a CPU of few cores, and for a matrix this small
+    # a call into cuSOLVER takes longer than the arithmetic.
+    table = jnp.concatenate([H_free, b_free], axis=1)
+    for column in range(m):
+        pivot = table[column, column]
+        row = table[column] / jnp.where(pivot > 0, pivot, jnp.nan)
+        table = (table - table[:, column, None] * row).at[column].set(row)
+    return table[:, m:].reshape(b.shape)
 
 
 def solve(

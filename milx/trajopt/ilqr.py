@@ -5,17 +5,18 @@ The problem: over T steps from a given x_0, with states x in R^n and actions u i
     minimise    J = Σ_{t<T} ½ |r(x_t, u_t, t)|² + ½ |r_T(x_T)|²
     subject to  x_{t+1} = f(x_t, u_t)  and  low ≤ u_t ≤ high.
 
-One iteration improves a plan (x̄, ū). Let A = f_x, B = f_u, r_x and r_u be the Jacobians along the plan, and let a prime
-mark the next step. The backward pass models the cost-to-go as V + V_xᵀ δx + ½ δxᵀ V_xx δx and finds, for each step,
+One iteration improves a plan (x̄, ū). With A = f_x, B = f_u, r_x and r_u taken along the plan and a prime for the next
+step, the backward pass begins at V_x = r_T,xᵀ r_T, V_xx = r_T,xᵀ r_T,x and finds, from the last step to the first,
 
     Q_u = r_uᵀ r + Bᵀ V_x'        Q_uu = r_uᵀ r_u + Bᵀ (V_xx' + μI) B        Q_ux = r_uᵀ r_x + Bᵀ (V_xx' + μI) A
-    k = argmin ½ kᵀ Q_uu k + kᵀ Q_u  subject to  low ≤ ū + k ≤ high,
-    K = -Q_uu⁻¹ Q_ux in the dimensions that no limit holds, and zero in the others.
+    k = argmin ½ kᵀ Q_uu k + kᵀ Q_u  subject to  low ≤ ū + k ≤ high
+    K = -Q_uu⁻¹ Q_ux in the dimensions that no limit holds, zero in the others
+    V_x = Sᵀ (r + r_u k) + Fᵀ (V_x' + V_xx' B k)        V_xx = SᵀS + Fᵀ V_xx' F    with  F = A + B K,  S = r_x + r_u K.
 
 The forward pass rolls out u = ū + α k + K (x - x̄) with several step sizes α at once and keeps the cheapest plan. The
-regularisation μ keeps new states near the old ones: it grows when no step size lowers the cost and shrinks when one
-does. Writing costs as residuals makes their Hessians Gauss-Newton's, so that V_xx is never indefinite, and asks for no
-derivative beyond the first, nor for reverse mode, which MJX lacks.
+regularisation μ holds new states near the old ones: it grows when no step size lowers the cost and shrinks when one
+does. Costs written as residuals have Gauss-Newton Hessians: V_xx, a sum of squares, is never indefinite, and nothing
+asks for second derivatives of f or for reverse mode, which MJX lacks.
 
 References:
     Tassa, Erez & Todorov, "Synthesis and stabilization of complex behaviors through online trajectory optimization",
@@ -84,20 +85,21 @@ class Options:
         step_sizes: the α that are tried together, none above 1.
         sufficient_decrease: the fraction of the expected decrease that an accepted step must reach.
         tolerance: converged once an iteration lowers the cost, or expects to, by no more than this fraction of it.
-        regularisation: the first μ. Convergence is not judged above it, where steps are short by force.
+        regularisation: the first μ. Too small a one lets the first step leap into a poor local minimum. Convergence is
+            not judged above it, where steps are short by force.
         regularisation_min: the smallest μ other than zero.
         regularisation_max: the solver gives up above this μ.
         regularisation_factor: Δ_0, by which the growth rate of μ rises at each failure and falls at each success.
     """
 
     iterations: int = 50
-    step_sizes: tuple[float, ...] = (1.0, 0.6, 0.3, 0.15, 0.07, 0.03, 0.01, 0.003)
+    step_sizes: tuple[float, ...] = (1.0, 0.5, 0.2, 0.05)
     sufficient_decrease: float = 1e-3
     tolerance: float = 1e-5
-    regularisation: float = 1e-3
+    regularisation: float = 1.0
     regularisation_min: float = 1e-6
     regularisation_max: float = 1e8
-    regularisation_factor: float = 2.0
+    regularisation_factor: float = 1.6
 
 
 class _Policy(NamedTuple):
@@ -131,11 +133,11 @@ def _backward(problem: Problem, states: jax.Array, actions: jax.Array, mu: jax.A
     def stage(x, u, t):
         return problem.dynamics(x, u), problem.running_residual(x, u, t)
 
-    ((A, B), (r_x, r_u)), (_, r) = linearize(stage, states[:-1], actions, jnp.arange(len(actions)))
+    ((A, B), (r_x, r_u)), (_, r) = linearize(stage, states[:-1], actions, jnp.arange(len(actions), dtype=jnp.int32))
     r_T, r_Tx = problem.terminal_residual(states[-1]), jax.jacfwd(problem.terminal_residual)(states[-1])
 
     def step(carry, inputs):
-        V_x, V_xx, slope, k_next = carry
+        V_x0, V_x, V_xx, k_next = carry
         u, r, A, B, r_x, r_u = inputs
         V_reg = V_xx + mu * jnp.eye(n, dtype=V_xx.dtype)
         Q_u = r_u.T @ r + B.T @ V_x
@@ -143,17 +145,16 @@ def _backward(problem: Problem, states: jax.Array, actions: jax.Array, mu: jax.A
         Q_ux = r_u.T @ r_x + B.T @ V_reg @ A
         k, free = boxqp.solve(Q_uu, Q_u, problem.control_low - u, problem.control_high - u, start=k_next)
         K = -boxqp.solve_free(Q_uu, Q_ux, free)
-        # The cost-to-go of this policy under the model without μ. As a sum of squares V_xx stays positive in float32.
-        # V_x belongs to the full step; its value at α = 0, the slope, makes the expected change exact at every α.
-        Bk, r_uk = B @ k, r_u @ k
         F, S = A + B @ K, r_x + r_u @ K
-        descent = k @ (r_u.T @ r + B.T @ slope)
-        full = k @ Q_u + 0.5 * (r_uk @ r_uk + Bk @ V_xx @ Bk)
-        V_x, V_xx = S.T @ (r + r_uk) + F.T @ (V_x + V_xx @ Bk), S.T @ S + F.T @ V_xx @ F
-        slope = S.T @ r + F.T @ slope
-        return (V_x, 0.5 * (V_xx + V_xx.T), slope, k), _Policy(k, K, jnp.stack([descent, full - descent]))
+        Bk, r_uk = B @ k, r_u @ k
+        # V_x is that of the full step. Its part at α = 0 makes the expected change exact for every α, whatever μ is.
+        linear = k @ (r_u.T @ r + B.T @ V_x0)
+        total = k @ Q_u + 0.5 * (r_uk @ r_uk + Bk @ V_xx @ Bk)
+        V_x0, V_x = S.T @ r + F.T @ V_x0, S.T @ (r + r_uk) + F.T @ (V_x + V_xx @ Bk)
+        V_xx = S.T @ S + F.T @ V_xx @ F
+        return (V_x0, V_x, 0.5 * (V_xx + V_xx.T), k), _Policy(k, K, jnp.stack([linear, total - linear]))
 
-    last = r_Tx.T @ r_T, r_Tx.T @ r_Tx, r_Tx.T @ r_T, jnp.zeros(m, actions.dtype)
+    last = r_Tx.T @ r_T, r_Tx.T @ r_T, r_Tx.T @ r_Tx, jnp.zeros(m, actions.dtype)
     _, (k, K, changes) = lax.scan(step, last, (actions, r, A, B, r_x, r_u), reverse=True)
     change = changes.sum(0)
     finite = jnp.isfinite(k).all() & jnp.isfinite(K).all() & jnp.isfinite(change).all()
@@ -171,7 +172,7 @@ def _forward(
         r = problem.running_residual(x, u, t)
         return problem.dynamics(x, u), (x, u, 0.5 * r @ r)
 
-    inputs = jnp.arange(len(actions)), states[:-1], actions, policy.k, policy.K
+    inputs = jnp.arange(len(actions), dtype=jnp.int32), states[:-1], actions, policy.k, policy.K
     last, (new_states, new_actions, costs) = lax.scan(step, states[0], inputs)
     r_T = problem.terminal_residual(last)
     return jnp.concatenate([new_states, last[None]]), new_actions, costs.sum() + 0.5 * r_T @ r_T
@@ -196,7 +197,7 @@ def solve(problem: Problem, initial_state: jax.Array, actions: jax.Array, option
         problem: what to solve. Its functions may close over traced arrays, such as the parameters of a task.
         initial_state: x_0, [n].
         actions: the first ū, [T, m]; moved into the limits.
-        options: settings, static.
+        options: settings; `Options()` by default.
     """
     options = options or Options()
     dtype = initial_state.dtype
@@ -209,7 +210,8 @@ def solve(problem: Problem, initial_state: jax.Array, actions: jax.Array, option
         states, _, costs = candidates
         expected = -(alphas * search.policy.change[0] + alphas**2 * search.policy.change[1])
         sufficient = search.cost - costs > options.sufficient_decrease * jnp.maximum(expected, 0.0)
-        accepted = sufficient & jnp.isfinite(costs) & jnp.isfinite(states).all((1, 2))
+        # NaN costs fail the comparison. The last state has to be looked at: no action and maybe no residual follows it.
+        accepted = sufficient & jnp.isfinite(states).all((1, 2))
         best = jnp.argmin(jnp.where(accepted, costs, jnp.inf))
         success = accepted[best]
         current = search.states, search.actions, search.cost
@@ -225,9 +227,8 @@ def solve(problem: Problem, initial_state: jax.Array, actions: jax.Array, option
     def unfinished(search: _Search) -> jax.Array:
         return ~search.converged & (search.iterations < options.iterations) & (search.mu <= options.regularisation_max)
 
-    # Iteration 0 rolls out the initial actions and finds their policy: with zero k and K every candidate is that
-    # rollout. So the dynamics appear only twice in the program, and little else takes time to compile. As this counts
-    # as a success, μ starts one factor higher.
+    # Pass 0 of the loop, not counted, rolls out the initial actions and finds their policy. So the dynamics, slow to
+    # compile, appear only twice in the program. As pass 0 counts as a success, μ starts one factor higher.
     low, high = problem.control_low, problem.control_high
     start = _Search(
         states=jnp.broadcast_to(initial_state, (T + 1, n)),
