@@ -49,6 +49,7 @@ class NetworkConfig:
         strides: stride of each convolution.
         kernel: height and width of every kernel.
         soft_argmax: spatial soft-argmax after the last convolution; flattened otherwise.
+        temperature: of the soft-argmax at the start; learned for every channel.
         fc_layers: sizes of the hidden fully connected layers.
         fc_norm: layer norm in the hidden fully connected layers.
         fc_init_std: standard deviation of their first weights; None for LeCun's initialisation.
@@ -61,6 +62,7 @@ class NetworkConfig:
     strides: tuple[int, ...] = (2, 2, 2)
     kernel: int = 3
     soft_argmax: bool = False
+    temperature: float = 1.0
     fc_layers: tuple[int, ...] = (200, 200, 200, 200)
     fc_norm: bool = True
     fc_init_std: float | None = None
@@ -180,9 +182,9 @@ def _reach_paper() -> Config:
 def _reach_fast() -> Config:
     return Config(
         network=NetworkConfig(strides=(2, 2, 1), soft_argmax=True, fc_layers=(200, 200), goal_head=True),
-        mil=MILConfig(inner_lr=0.03, learn_inner_lr=True, whiten_actions=True, goal_weight=1.0),
+        mil=MILConfig(inner_lr=0.03, learn_inner_lr=True, whiten_actions=True, goal_weight=10.0),
         optimizer=OptimizerConfig(warmup=0.05, cosine=True, clip_norm=1.0),
-        train=TrainConfig(steps=8000, meta_batch=16, support_frames=25, query_frames=25),
+        train=TrainConfig(steps=24_000, meta_batch=40, support_frames=10, query_frames=10),
     )
 
 

@@ -90,9 +90,7 @@ class MIL(Method):
         output = self.network.apply(theta, flat.image, state.reshape(-1, state.shape[-1]))
         action = output.inner_action if inner else output.action
         error = self.config.loss_scale * (action - whitening.action(flat.action))
-        action_loss = jnp.mean(jnp.square(error))
-        import os
-        loss = action_loss * (float(os.environ.get('IAW','1')) if inner else 1.0)
+        loss = action_loss = jnp.mean(jnp.square(error))
         metrics = {"action_loss": action_loss}
         if output.goal is not None:
             goal = state[:, -1:, jnp.array(self.goal_indices)]

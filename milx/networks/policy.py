@@ -1,5 +1,6 @@
 """The policy network of the paper: convolutions, then fully connected layers that also see the robot's state."""
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -7,9 +8,6 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-import os
-
-TEMP = float(os.environ.get("TEMP0", "0"))
 from milx.config import NetworkConfig
 from milx.networks.layers import ConvBlock, Dense, spatial_soft_argmax
 from milx.types import Params
@@ -53,7 +51,9 @@ class _Policy(nn.Module):
         for filters, stride in zip(config.filters, config.strides, strict=True):
             x = ConvBlock(filters, config.kernel, stride)(x)
         if config.soft_argmax:
-            log_temperature = self.param("log_temperature", nn.initializers.constant(TEMP), x.shape[-1:])
+            log_temperature = self.param(
+                "log_temperature", nn.initializers.constant(math.log(config.temperature)), x.shape[-1:]
+            )
             x = spatial_soft_argmax(x, jnp.exp(log_temperature))
         else:
             x = x.reshape(len(x), -1)
