@@ -36,7 +36,7 @@ class DataConfig:
     tasks: int = 1500
     demos_per_task: int = 10
     noise: float = 0.01
-    plan_iterations: int = 10
+    plan_iterations: int = 16
     plan_batch: int = 16384
 
 
@@ -48,8 +48,7 @@ class NetworkConfig:
         filters: output channels of each convolution.
         strides: stride of each convolution.
         kernel: height and width of every kernel.
-        soft_argmax: spatial soft-argmax after the last convolution; flattened otherwise.
-        temperature: of the soft-argmax at the start; learned for every channel.
+        soft_argmax: spatial soft-argmax after the last convolution, with a learned temperature; flattened otherwise.
         fc_layers: sizes of the hidden fully connected layers.
         fc_norm: layer norm in the hidden fully connected layers.
         fc_init_std: standard deviation of their first weights; None for LeCun's initialisation.
@@ -62,7 +61,6 @@ class NetworkConfig:
     strides: tuple[int, ...] = (2, 2, 2)
     kernel: int = 3
     soft_argmax: bool = False
-    temperature: float = 1.0
     fc_layers: tuple[int, ...] = (200, 200, 200, 200)
     fc_norm: bool = True
     fc_init_std: float | None = None
@@ -184,14 +182,14 @@ def _reach_fast() -> Config:
         network=NetworkConfig(strides=(2, 2, 1), soft_argmax=True, fc_layers=(200, 200), goal_head=True),
         mil=MILConfig(inner_lr=0.03, learn_inner_lr=True, whiten_actions=True, goal_weight=10.0),
         optimizer=OptimizerConfig(warmup=0.05, cosine=True, clip_norm=1.0),
-        train=TrainConfig(steps=24_000, meta_batch=40, support_frames=10, query_frames=10),
+        train=TrainConfig(steps=24_000, meta_batch=64, support_frames=6, query_frames=6),
     )
 
 
 def _reach_cpu() -> Config:
     config = _reach_fast()
     config.env = EnvConfig(image_shape=(32, 40))
-    config.data = DataConfig(tasks=400, demos_per_task=6, plan_iterations=6, plan_batch=100)
+    config.data = DataConfig(tasks=400, demos_per_task=6, plan_iterations=8, plan_batch=100)
     config.network.filters = (24, 24, 24)
     config.network.strides = (2, 1, 1)
     config.network.fc_layers = (100, 100)
@@ -238,7 +236,7 @@ def from_dict(values: dict[str, Any]) -> Config:
 
 def flatten(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     """Nested dictionaries as one, with dotted names."""
-    flat = {}
+    flat: dict[str, Any] = {}
     for name, value in values.items():
         flat |= flatten(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
     return flat

@@ -1,5 +1,36 @@
-"""Evaluates a run's best checkpoint on held-out tasks, with floors and ceiling.
+"""Evaluates a run's best checkpoint again, on held-out tasks, with floors and ceiling.
 
-python -m milx.evaluate --workdir=runs/reach-mil-fast-0
-python -m milx.evaluate --workdir=runs/reach-mil-fast-0 --config.evaluation.shots=5
+    python -m milx.evaluate --workdir=runs/reach-mil-fast-0
+
+rewrites evaluation.json, the plot and the video in the run's folder.
 """
+
+import json
+import pathlib
+import sys
+
+from absl import app, flags, logging
+
+from milx import config as config_lib
+from milx.run import Run
+
+_WORKDIR = flags.DEFINE_string("workdir", None, "Folder of the run.", required=True)
+
+
+def main(argv: list[str]) -> None:
+    """Evaluates the run in --workdir."""
+    if len(argv) > 1:
+        raise app.UsageError(f"unexpected argument {argv[1]!r}")
+    logging.set_verbosity(logging.WARNING)
+    path = pathlib.Path(_WORKDIR.value) / "config.json"
+    if not path.is_file():
+        sys.exit(f"milx: workdir: {path.parent} has no config.json, expected a folder of `python -m milx.train`")
+    try:
+        run = Run(config_lib.from_dict(json.loads(path.read_text())), path.parent)
+        run.report(run.evaluate())
+    except ValueError as error:
+        sys.exit(f"milx: {error}")
+
+
+if __name__ == "__main__":
+    app.run(main)

@@ -4,7 +4,7 @@ import sys
 from collections.abc import Callable, Sequence
 
 import jax
-from absl import app, flags
+from absl import app, flags, logging
 from ml_collections import config_flags
 
 from milx import config as config_lib
@@ -22,8 +22,8 @@ def define_flags() -> None:
     flags.DEFINE_string(
         "preset",
         None,
-        "Hyperparameters: paper (as published), fast (the best for an accelerator, its default), cpu (smaller images and "
-        "networks; the default without an accelerator). Any field can be changed with --config.path.to.field=value.",
+        "Hyperparameters: paper (as published), fast (the best for an accelerator, its default), cpu (smaller images "
+        "and networks; the default without an accelerator). --config.path.to.field=value changes any of them.",
     )
     flags.DEFINE_integer("seed", 0, "Seed of training tasks, initial parameters and batches.", lower_bound=0)
     flags.DEFINE_string("workdir", None, "Folder of the run; default runs/<env>-<method>-<preset>-<seed>.")
@@ -45,17 +45,16 @@ def run(main: Callable[[Config, str], None]) -> None:
         return FLAGS(argv)
 
     def start(argv: Sequence[str]) -> None:
+        logging.set_verbosity(logging.WARNING)
         if len(argv) > 1:
             raise app.UsageError(f"unexpected argument {argv[1]!r}")
         config = FLAGS.config
         if FLAGS.preset is None:
-            backend = jax.default_backend()
-            print(
-                f"Running on {backend} with --preset={config.preset}, its default; choose with --preset={{{','.join(PRESETS[config.env_name])}}}."
-            )
-        workdir = FLAGS.workdir or f"runs/{config.env_name}-{config.method_name}-{config.preset}-{config.seed}"
+            others = ", ".join(f"--preset={name}" for name in PRESETS[config.env_name] if name != config.preset)
+            print(f"Running on {jax.default_backend()} with its default, --preset={config.preset}; also: {others}.")
+        name = f"{config.env_name}-{config.method_name}-{config.preset}-{config.seed}"
         try:
-            main(config, workdir)
+            main(config, FLAGS.workdir or f"runs/{name}")
         except ValueError as error:
             sys.exit(f"milx: {error}")
 

@@ -34,6 +34,18 @@ EVALUATION_SEED = 2017
 """Validation and test tasks and their trials are the same for every seed of a run."""
 
 
+def split_demos(env: envs.Env, config: Config, split: str) -> DemoSet:
+    """The demonstrations of a split as a run uses them, planned or from the cache of earlier runs."""
+    num_tasks, num_demos = {
+        "train": (config.data.tasks, config.data.demos_per_task),
+        "validation": (config.evaluation.validation_tasks, config.evaluation.shots),
+        "test": (config.evaluation.tasks, config.evaluation.shots),
+    }[split]
+    seed = config.seed if split == "train" else EVALUATION_SEED
+    folder = platform.cache_folder() / "demos"
+    return demos_lib.cached(folder, env, seed, split, num_tasks, num_demos, config.data)
+
+
 def _trial_key(split: str) -> jax.Array:
     """Draws the trial scenes of a split."""
     return jax.random.fold_in(jax.random.key(EVALUATION_SEED), len(envs.SPLITS) + envs.SPLITS.index(split))
@@ -60,7 +72,8 @@ class Run:
         self.trainer = Trainer(
             self.env, self.method, config.train, make_optimizer(config.optimizer, config.train.steps)
         )
-        self.seconds = {"demos": 0.0, "compile": 0.0, "train": 0.0, "evaluate": 0.0}
+        self.seconds = {"demos": 0.0, "compile": 0.0, "train": 0.0, "evaluate": 0.0, "total": 0.0}
+        self._began = time.perf_counter()
         self._claim_folder()
 
     def train(self) -> None:
@@ -92,15 +105,19 @@ class Run:
                     metrics.write(step, {"validation_success": success})
                     progress.console.print(f"step {step}: validation success {success:.1%}")
                     items = {"params": state.params, "trainer": (state.step, state.optimizer)}
-                    checkpoints.save(step, items, success, {"seconds": self.seconds, "dataset_hash": dataset_hash})
+                    checkpoints.save(step, items, success, {"seconds": self._elapsed(), "dataset_hash": dataset_hash})
         metrics.close()
         checkpoints.close()
 
     def evaluate(self) -> dict[str, Any]:
-        """Evaluates the best checkpoint on the test tasks; writes and returns evaluation.json, with plot and video."""
+        """Evaluates the best checkpoint on the test tasks; writes and returns evaluation.json, with plot and video.
+
+        Raises:
+            ValueError: if there is no checkpoint yet.
+        """
         checkpoints = Checkpoints(self.folder / "checkpoints", read_only=True)
         step = checkpoints.best
-        if step is None:
+        if step is None or checkpoints.latest is None:
             raise ValueError(f"workdir: {self.folder} has no checkpoint yet; train first")
         items, _ = checkpoints.restore(step, {"params": params_like(self.method, spec_of(self.env))})
         _, extra = checkpoints.restore(checkpoints.latest, {})
@@ -130,18 +147,10 @@ class Run:
 
     def demos(self, split: str) -> DemoSet:
         """The demonstrations of a split, planned or from the cache of earlier runs."""
-        data, evaluation = self.config.data, self.config.evaluation
-        num_tasks, num_demos = {
-            "train": (data.tasks, data.demos_per_task),
-            "validation": (evaluation.validation_tasks, evaluation.shots),
-            "test": (evaluation.tasks, evaluation.shots),
-        }[split]
-        seed = self.config.seed if split == "train" else EVALUATION_SEED
-        what = f"{num_tasks * num_demos} {split} demonstrations"
-        with self._clock("demos"), self.console.status(f"planning {what}"):
-            folder = platform.cache_folder() / "demos"
-            demos = demos_lib.cached(folder, self.env, seed, split, num_tasks, num_demos, data)
-        self.console.print(f"{what}, of which {float(demos.success.mean()):.1%} succeed")
+        with self._clock("demos"), self.console.status(f"planning {split} demonstrations"):
+            demos = split_demos(self.env, self.config, split)
+        count, success = demos.success.size, float(demos.success.mean())
+        self.console.print(f"{count} {split} demonstrations, of which {success:.1%} succeed")
         return demos
 
     def _start(self, train: DemoSet, checkpoints: Checkpoints) -> tuple[TrainState, jax.Array]:
@@ -191,7 +200,7 @@ class Run:
             **summary,
             "criterion": self.env.criterion,
             "baselines": floors,
-            "wall_clock_s": {**self.seconds, "total": sum(self.seconds.values())},
+            "wall_clock_s": self._elapsed(),
             "steps": step,
             "config": config_lib.to_dict(config),
             "dataset_hash": dataset_hash,
@@ -217,6 +226,13 @@ class Run:
         began = time.perf_counter()
         yield
         self.seconds[name] += time.perf_counter() - began
+
+    def _elapsed(self) -> dict[str, float]:
+        """Seconds spent by this run so far, earlier sessions included."""
+        now = time.perf_counter()
+        self.seconds["total"] += now - self._began
+        self._began = now
+        return dict(self.seconds)
 
     def _progress(self, steps: int) -> Progress:
         columns = (

@@ -1,7 +1,7 @@
 """Meta-training: everything between two log lines is one scan on the device.
 
-Sampling, rendering, inner step, meta-gradient and Adam all happen inside the scan. Batches are functions of (seed, step),
-so a run that is stopped and started again repeats the uninterrupted run from its last checkpoint.
+Sampling, rendering, inner step, meta-gradient and Adam all happen inside the scan. Batches are functions of the seed
+and the step, so a run that is stopped and started again repeats the uninterrupted run from its last checkpoint.
 """
 
 import dataclasses

@@ -10,6 +10,9 @@ from typing import Any
 
 import jax
 
+Array = Any
+"""A `jax.Array`; at milx's doors also a NumPy array, and inside `jax.eval_shape` a `jax.ShapeDtypeStruct`."""
+
 Params = Any
 """A pytree of arrays: what a method learns, or what it has adapted to one task."""
 
@@ -27,8 +30,8 @@ class Observation:
         state: [S] float32, the robot's own state in its natural units.
     """
 
-    image: jax.Array | None = None
-    state: jax.Array | None = None
+    image: Array = None
+    state: Array = None
 
 
 @jax.tree_util.register_dataclass
@@ -42,9 +45,9 @@ class Demo:
         action: [T, A] float32; None when the demonstration has no actions.
     """
 
-    image: jax.Array | None = None
-    state: jax.Array | None = None
-    action: jax.Array | None = None
+    image: Array = None
+    state: Array = None
+    action: Array = None
 
     @property
     def observation(self) -> Observation:

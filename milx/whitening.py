@@ -5,6 +5,8 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
+from milx.types import Array
+
 MIN_STD = 1e-3
 """Entries that hardly vary are divided by this and no less (as the paper's released code does)."""
 
@@ -21,10 +23,10 @@ class Whitening:
         action_scale: [A], at least MIN_STD.
     """
 
-    state_mean: jax.Array
-    state_scale: jax.Array
-    action_mean: jax.Array
-    action_scale: jax.Array
+    state_mean: Array
+    state_scale: Array
+    action_mean: Array
+    action_scale: Array
 
     def state(self, state: jax.Array) -> jax.Array:
         """Whitens states [..., S]."""

@@ -1,0 +1,1 @@
+"""Demonstrations: simulated ones, and their batches."""

@@ -203,7 +203,8 @@ def save(path: pathlib.Path, demos: DemoSet) -> None:
     """Writes a set as one .npz file; a file of that name is replaced only once the new one is complete."""
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_suffix(".partial.npz")
-    np.savez_compressed(partial, **{name: np.asarray(leaf) for name, leaf in leaves(demos).items()})
+    arrays: dict[str, Any] = {name: np.asarray(leaf) for name, leaf in leaves(demos).items()}
+    np.savez_compressed(partial, **arrays)
     partial.replace(path)
 
 

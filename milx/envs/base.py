@@ -51,7 +51,8 @@ class State:
 class Env(abc.ABC):
     """A simulated environment on MJX.
 
-    Subclasses set the class attributes and write the abstract methods; all methods are pure and take one world, `jax.vmap` gives batches.
+    Subclasses set the class attributes and write the abstract methods. All methods are pure and take one world;
+    `jax.vmap` gives batches.
 
     Attributes:
         name: the registry's key.
@@ -74,7 +75,8 @@ class Env(abc.ABC):
     def __init__(self, model: mujoco.MjModel, image_shape: tuple[int, int] | None = None):
         self.mj_model = model
         self.model = mjx.put_model(model)
-        self.image_shape = tuple(image_shape or self.image_shape)
+        if image_shape is not None:
+            self.image_shape = image_shape
         self.renderer = Renderer(model, self.camera, *self.image_shape)
         self._data = mjx.make_data(self.model)
 

@@ -52,11 +52,11 @@ class MIL(Method):
         rates = jax.tree.map(lambda _: self.config.inner_lr, theta)
         if self.config.learn_inner_lr:
             rates = jax.tree.map(lambda s: self.config.inner_lr * jnp.exp(s), params["inner_log_lr"])
+        clip = self.config.inner_clip
         for _ in range(self.config.inner_steps):
             grad, _ = jax.grad(self.imitation_loss, has_aux=True)(theta, params["whitening"], demo, inner=True)
             if self.config.first_order:
                 grad = jax.lax.stop_gradient(grad)
-            clip = self.config.inner_clip
             theta = jax.tree.map(lambda p, g, rate: p - rate * jnp.clip(g, -clip, clip), theta, grad, rates)
         return {"policy": theta, "whitening": params["whitening"]}
 

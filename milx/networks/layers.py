@@ -1,8 +1,8 @@
 """Layers whose weights may differ from task to task.
 
-After adaptation every task has its own kernels, and `vmap` over tasks turns `lax.conv` into a grouped convolution, which
-XLA runs badly everywhere. Written as strided slices and one matrix product, the same convolution becomes a batched
-matrix product.
+After adaptation every task has its own kernels, and `vmap` over tasks turns `lax.conv` into a grouped convolution,
+which XLA runs badly everywhere. Written as strided slices and one matrix product, the same convolution becomes a
+batched matrix product.
 """
 
 import flax.linen as nn

@@ -1,6 +1,5 @@
 """The policy network of the paper: convolutions, then fully connected layers that also see the robot's state."""
 
-import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -36,7 +35,7 @@ class PolicyNetwork(NamedTuple):
     """
 
     init: Callable[[jax.Array], Params]
-    apply: Callable[[Params, jax.Array | None, jax.Array], PolicyOutput]
+    apply: Callable[[Params, jax.Array, jax.Array], PolicyOutput]
 
 
 class _Policy(nn.Module):
@@ -51,10 +50,7 @@ class _Policy(nn.Module):
         for filters, stride in zip(config.filters, config.strides, strict=True):
             x = ConvBlock(filters, config.kernel, stride)(x)
         if config.soft_argmax:
-            log_temperature = self.param(
-                "log_temperature", nn.initializers.constant(math.log(config.temperature)), x.shape[-1:]
-            )
-            x = spatial_soft_argmax(x, jnp.exp(log_temperature))
+            x = spatial_soft_argmax(x, jnp.exp(self.param("log_temperature", nn.initializers.zeros, x.shape[-1:])))
         else:
             x = x.reshape(len(x), -1)
 
@@ -90,7 +86,9 @@ def make_policy(
     def init(key: jax.Array) -> Params:
         return module.init(key, jnp.zeros((1, *image_shape, 3), jnp.uint8), jnp.zeros((1, state_size)))["params"]
 
-    def apply(params: Params, image: jax.Array | None, state: jax.Array) -> PolicyOutput:
-        return module.apply({"params": params}, image, state)
+    def apply(params: Params, image: jax.Array, state: jax.Array) -> PolicyOutput:
+        output = module.apply({"params": params}, image, state)
+        assert isinstance(output, PolicyOutput)
+        return output
 
     return PolicyNetwork(init, apply)

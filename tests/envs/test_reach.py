@@ -1,0 +1,270 @@
+"""The reach environment against C MuJoCo, and its laws: colours, scenes, success, what the camera sees."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+import milx
+from milx.envs import reach
+from milx.envs.base import State
+
+EPISODES = 4
+IMAGE_SHAPE = (48, 60)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def float64():
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.fixture(scope="module")
+def env():
+    return milx.make("reach", IMAGE_SHAPE)
+
+
+@pytest.fixture(scope="module")
+def task(env):
+    return env.sample_task(jax.random.key(0), "train")
+
+
+@pytest.fixture(scope="module")
+def actions(env):
+    """Random controls; half of the episodes go beyond the range, where the environment clips."""
+    scale = np.array([0.2, 1.0, 1.5, 3.0])[:, None, None]
+    return scale * np.random.default_rng(0).uniform(-1, 1, (EPISODES, env.horizon, env.action_size))
+
+
+@pytest.fixture(scope="module")
+def states(env, task, actions):
+    """States [EPISODES, T + 1] under the actions, and what the robot knows in them."""
+
+    @jax.jit
+    @jax.vmap
+    def episode(key, actions):
+        def step(state, action):
+            after = env.step(task, state, action)
+            return after, after
+
+        start = env.reset(key, task)
+        _, after = jax.lax.scan(step, start, actions)
+        states = jax.tree.map(lambda x, xs: jnp.concatenate([x[None], xs]), start, after)
+        return states, jax.vmap(env.robot_state)(states)
+
+    return episode(jax.random.split(jax.random.key(1), EPISODES), actions)
+
+
+@pytest.fixture(scope="module")
+def tasks(env):
+    """4,000 tasks of every split."""
+    keys = jax.random.split(jax.random.key(2), 4000)
+    return {
+        split: jax.jit(jax.vmap(lambda key, split=split: env.sample_task(key, split)))(keys)
+        for split in ("train", "validation", "test")
+    }
+
+
+def assert_uniform(counts):
+    """Counts of equally likely outcomes lie within four standard deviations of their mean."""
+    counts = np.asarray(counts)
+    n, p = counts.sum(), 1 / counts.size
+    np.testing.assert_allclose(counts, n * p, atol=4 * np.sqrt(n * p * (1 - p)))
+
+
+# Physics.
+
+
+def test_same_controls_give_the_trajectory_of_c_mujoco(env, actions, states):
+    states, _ = states
+    model = mujoco.MjModel.from_xml_path(str(reach.ASSETS / "reach.xml"))
+    assert np.abs(actions).max() > 2
+    for i in range(EPISODES):
+        data = mujoco.MjData(model)
+        qpos, qvel = [data.qpos.copy()], [data.qvel.copy()]
+        for action in actions[i]:
+            data.ctrl[:] = np.clip(action, -1, 1)
+            for _ in range(5):
+                mujoco.mj_step(model, data)
+            qpos.append(data.qpos.copy())
+            qvel.append(data.qvel.copy())
+        assert data.time == pytest.approx(50 * 0.05)
+        assert np.ptp(qpos) > 1, "the arm must move for the comparison to mean something"
+        np.testing.assert_allclose(states.qpos[i], qpos, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(states.qvel[i], qvel, rtol=0, atol=1e-9)
+
+
+def test_robot_state_is_that_of_c_mujoco(env, states):
+    states, robot = states
+    data = mujoco.MjData(env.mj_model)
+    site = env.mj_model.site("fingertip").id
+    velocity = np.zeros(6)
+    for i, t in np.ndindex(EPISODES, env.horizon + 1):
+        data.qpos[:], data.qvel[:] = states.qpos[i, t], states.qvel[i, t]
+        mujoco.mj_forward(env.mj_model, data)
+        mujoco.mj_objectVelocity(env.mj_model, data, mujoco.mjtObj.mjOBJ_SITE, site, velocity, 0)
+        expected = np.concatenate([data.qpos, data.qvel, data.site_xpos[site, :2], velocity[3:5]])
+        np.testing.assert_allclose(robot[i, t], expected, rtol=1e-9, atol=1e-9)
+
+
+# Tasks and scenes.
+
+
+def test_splits_draw_colours_from_disjoint_grids(tasks):
+    seen = {}
+    for split, offset in {"train": 0, "validation": 25, "test": 50}.items():
+        color = np.asarray(tasks[split].object_color)
+        thousandths = np.rint(1000 * color).astype(int)
+        np.testing.assert_allclose(1000 * color, thousandths, atol=1e-3)
+        assert set(thousandths.ravel()) == set(range(offset, offset + 1000, 100))
+        for cube in range(3):
+            for channel in range(3):
+                assert_uniform(np.unique(thousandths[:, cube, channel], return_counts=True)[1])
+        seen[split] = {tuple(rgb) for rgb in thousandths.reshape(-1, 3)}
+        assert len(seen[split]) > 990, "12,000 draws of 1,000 colours"
+    assert not seen["train"] & seen["test"]
+    assert not seen["train"] & seen["validation"]
+    assert not seen["validation"] & seen["test"]
+
+
+def test_a_task_has_three_colours_and_any_cube_as_target(tasks):
+    for drawn in tasks.values():
+        color = np.asarray(drawn.object_color)
+        gap = np.abs(color[:, [0, 0, 1]] - color[:, [1, 2, 2]]).max(axis=-1)
+        assert gap.min() > 0.099
+        assert_uniform(np.bincount(drawn.target, minlength=3))
+
+
+def test_scenes_keep_their_distances_and_the_arm_starts_at_zero(env, task):
+    draws = 20_000
+    scenes = jax.jit(jax.vmap(env.reset, in_axes=(0, None)))(jax.random.split(jax.random.key(3), draws), task)
+    np.testing.assert_array_equal(scenes.qpos, 0)
+    np.testing.assert_array_equal(scenes.qvel, 0)
+    position = np.asarray(scenes.mocap_pos)
+    assert np.abs(position[..., :2]).max() <= 0.2
+    np.testing.assert_allclose(position[..., 2], 0.03, rtol=1e-6)
+    gaps = np.linalg.norm(position[:, [0, 0, 1], :2] - position[:, [1, 2, 2], :2], axis=-1)
+    assert 0.15 <= gaps.min() < 0.151
+    # Every cube may stand in every quadrant.
+    for cube in range(3):
+        assert_uniform(np.bincount((position[:, cube, :2] > 0) @ [1, 2], minlength=4))
+
+
+def test_scenes_are_uniform_under_the_distance_rule(env, task):
+    """The mean distance between two cubes is that of rejection sampling in NumPy."""
+    positions = np.random.default_rng(0).uniform(-0.2, 0.2, (100_000, 3, 2))
+    gaps = np.linalg.norm(positions[:, [0, 0, 1]] - positions[:, [1, 2, 2]], axis=-1)
+    expected = gaps[gaps.min(axis=-1) >= 0.15]
+    scenes = jax.jit(jax.vmap(env.reset, in_axes=(0, None)))(jax.random.split(jax.random.key(4), 20_000), task)
+    position = np.asarray(scenes.mocap_pos)[..., :2]
+    gaps = np.linalg.norm(position[:, [0, 0, 1]] - position[:, [1, 2, 2]], axis=-1)
+    error = expected.std() / np.sqrt(len(gaps)) + expected.std() / np.sqrt(len(expected))
+    np.testing.assert_allclose(gaps.mean(axis=0), expected.mean(), atol=4 * error)
+
+
+def test_task_blind_goes_to_every_cube_equally_often(env, task):
+    keys = jax.random.split(jax.random.key(5), 6000)
+    for target in range(3):
+        blind = jax.vmap(env.task_blind, in_axes=(0, None))(keys, dataclasses.replace(task, target=jnp.array(target)))
+        assert_uniform(np.bincount(blind.target, minlength=3))
+        np.testing.assert_array_equal(blind.object_color, np.broadcast_to(task.object_color, (6000, 3, 3)))
+
+
+# Success.
+
+
+@pytest.fixture(scope="module")
+def succeeds(env, task):
+    """(set of steps, gap in m) -> success of an episode whose fingertip is the gap from the target in those steps.
+
+    In all other steps the fingertip touches a distractor, 0.3 m away.
+    """
+    success = jax.jit(lambda states: env.success(dataclasses.replace(task, target=1), states))
+
+    def run(steps, gap):
+        touching = np.isin(np.arange(51), list(steps))
+        qpos = np.where(touching[:, None], [0.0, 0.0], [np.pi / 2, 0.0])
+        # The arm is 0.21 m long: its fingertip is at (0.21, 0) or at (0, 0.21).
+        cubes = np.array([[0, 0.21, 0.03], [0.21, -gap, 0.03], [-0.1, -0.1, 0.03]])
+        states = State(jnp.asarray(qpos), jnp.zeros((51, 2)), jnp.broadcast_to(cubes, (51, 3, 3)))
+        return bool(success(states))
+
+    return run
+
+
+def test_success_is_a_touch_in_one_of_the_last_ten_states(succeeds):
+    for step in range(41, 51):
+        assert succeeds({step}, 0.0), step
+    assert not succeeds(range(41), 0.0)
+    assert not succeeds({40}, 0.0)
+    assert not succeeds((), 0.0)
+
+
+def test_success_is_closer_than_five_centimetres(succeeds):
+    assert succeeds({50}, 0.0499)
+    assert not succeeds({50}, 0.0501)
+    assert not succeeds(range(51), 0.0501)
+
+
+# What the camera sees.
+
+
+def pixel(point):
+    """(row, column) of a point in the world: the camera looks down from 1.2 m with 24 degrees from top to bottom."""
+    height, width = IMAGE_SHAPE
+    per_metre = height / (2 * np.tan(np.deg2rad(12)) * (1.2 - point[2]))
+    return int(height / 2 - per_metre * point[1]), int(width / 2 + per_metre * point[0])
+
+
+def test_the_image_shows_cubes_and_fingertip_where_they_are():
+    rng = np.random.default_rng(0)
+    n = 24
+    with jax.enable_x64(False):
+        env = milx.make("reach", IMAGE_SHAPE)
+        keys = jax.random.split(jax.random.key(6), n)
+        tasks = jax.vmap(lambda key: env.sample_task(key, "test"))(keys)
+        primaries = np.stack([rng.permutation(np.eye(3)) for _ in range(n)])
+        tasks = dataclasses.replace(tasks, object_color=jnp.asarray(primaries, jnp.float32))
+        states = jax.vmap(env.reset)(keys, tasks)
+        states = dataclasses.replace(states, qpos=jnp.asarray(rng.uniform(-3, 3, (n, 2)), jnp.float32))
+        observation = jax.jit(jax.vmap(env.observe))(tasks, states)
+    assert observation.image.dtype == np.uint8
+    image, robot = np.asarray(observation.image, float), np.asarray(observation.state)
+    np.testing.assert_allclose(robot[:, :2], states.qpos, atol=1e-6)
+    targets_seen = 0
+    for i in range(n):
+        elbow = 0.1 * np.array([np.cos(robot[i, 0]), np.sin(robot[i, 0])])
+        along = np.linspace(0, 1, 20)[:, None]
+        arm = np.concatenate([along * elbow, elbow + along * (robot[i, 4:6] - elbow)])
+        for cube in range(3):
+            centre = np.asarray(states.mocap_pos[i, cube])
+            if np.linalg.norm(arm - centre[:2], axis=-1).min() < 0.06:
+                continue  # the arm, above the cubes, may hide this one
+            row, column = pixel([*centre[:2], 0.06])
+            color = image[i, row, column]
+            cosine = color @ primaries[i, cube] / np.linalg.norm(color)
+            assert cosine > 0.98, f"scene {i}, cube {cube}: {color}"
+            targets_seen += cube == int(tasks.target[i])
+            # 7 cm from its centre the cube has ended.
+            away = [*(centre[:2] - 0.07 * np.sign(centre[:2]) * [1, 0]), 0.0]
+            others = np.delete(np.asarray(states.mocap_pos[i, :, :2]), cube, axis=0)
+            if np.abs(others - away[:2]).max(axis=-1).min() > 0.06:
+                color = image[i, *pixel(away)]
+                assert color @ primaries[i, cube] / np.linalg.norm(color) < 0.9
+        # The fingertip is yellow: much red, some green, little blue.
+        red, green, blue = image[i, *pixel([*robot[i, 4:6], 0.09])]
+        assert red > green > 2 * blue
+    assert targets_seen >= 6
+
+
+# Errors.
+
+
+def test_unknown_names_are_told_the_known_ones(env):
+    with pytest.raises(ValueError, match="split: got 'trian', expected one of train, validation, test"):
+        env.sample_task(jax.random.key(0), "trian")
+    with pytest.raises(ValueError, match="env: got 'nope', expected one of reach"):
+        milx.make("nope")

@@ -1,0 +1,338 @@
+"""MIL's meta-gradient against finite differences and closed forms, and the laws of its inner step."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from milx import methods
+from milx.config import Config, MILConfig, NetworkConfig
+from milx.methods.maml import MIL
+from milx.networks.policy import PolicyNetwork, PolicyOutput, make_policy
+from milx.types import Demo, Observation, TaskBatch
+from milx.whitening import Whitening
+
+IMAGE_SHAPE, STATE, ACTION, TASKS, STEPS = (8, 10), 4, 2, 3, 5
+GOAL_INDICES = (1, 3)
+TINY = {"filters": (4, 4), "strides": (2, 2), "fc_layers": (8,), "bias_transformation": 3}
+NO_CLIP = 1e9
+
+
+@pytest.fixture(autouse=True, scope="module")
+def float64():
+    with jax.enable_x64(True):
+        yield
+
+
+def random_demos(rng, *shape):
+    """Demonstrations with leading axes `shape`."""
+    return Demo(
+        image=jnp.asarray(rng.integers(0, 256, (*shape, STEPS, *IMAGE_SHAPE, 3), dtype=np.uint8)),
+        state=jnp.asarray(rng.standard_normal((*shape, STEPS, STATE))),
+        action=jnp.asarray(rng.standard_normal((*shape, STEPS, ACTION))),
+    )
+
+
+def random_whitening(rng):
+    return Whitening(
+        state_mean=jnp.asarray(rng.standard_normal(STATE)),
+        state_scale=jnp.asarray(rng.uniform(0.5, 2, STATE)),
+        action_mean=jnp.asarray(rng.standard_normal(ACTION)),
+        action_scale=jnp.asarray(rng.uniform(0.5, 2, ACTION)),
+    )
+
+
+@pytest.fixture(scope="module")
+def batch():
+    rng = np.random.default_rng(0)
+    return TaskBatch(support=random_demos(rng, TASKS, 1), query=random_demos(rng, TASKS, 2))
+
+
+@functools.cache
+def random_params(**network):
+    """A tiny network and parameters that are nowhere zero."""
+    policy = make_policy(NetworkConfig(**TINY | network), IMAGE_SHAPE, STATE, ACTION, len(GOAL_INDICES))
+    rng = np.random.default_rng(1)
+    draw = lambda leaf: jnp.asarray(leaf + 0.2 * rng.standard_normal(leaf.shape))  # noqa: E731
+    return policy, jax.tree.map(draw, jax.jit(policy.init)(jax.random.key(0)))
+
+
+def build(network=None, **config):
+    """MIL on a tiny network, and its parameters."""
+    policy, theta = random_params(**network or {})
+    rng = np.random.default_rng(2)
+    params = {"policy": theta, "whitening": random_whitening(rng)}
+    if config.get("learn_inner_lr"):
+        params["inner_log_lr"] = jax.tree.map(lambda _: jnp.asarray(0.3 * rng.standard_normal()), theta)
+    return MIL(MILConfig(**{"inner_lr": 0.05, "inner_clip": NO_CLIP} | config), policy, GOAL_INDICES), params
+
+
+def assert_trees_close(found, expected, **tolerance):
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, **tolerance), found, expected)
+
+
+def difference(after, before):
+    return jax.tree.map(lambda a, b: a - b, after, before)
+
+
+# The meta-gradient of the tiny network.
+
+VARIANTS = {
+    "one step": (None, {}),
+    "two steps, clipped": (None, {"inner_steps": 2, "inner_clip": 0.1, "loss_scale": 3.0, "inner_lr": 0.02}),
+    "two steps, two heads, goal, learned rates": (
+        {"heads": 2, "goal_head": True, "soft_argmax": True},
+        {"inner_steps": 2, "learn_inner_lr": True, "goal_weight": 0.7},
+    ),
+}
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_meta_gradient_is_that_of_finite_differences(batch, variant):
+    network, config = VARIANTS[variant]
+    method, params = build(network, **config)
+    loss = jax.jit(lambda params: method.loss(params, batch)[0])
+    gradient = jax.jit(jax.grad(loss))(params)
+    if config.get("inner_clip"):
+        inner, _ = jax.jit(jax.grad(method.imitation_loss, has_aux=True))(
+            params["policy"], params["whitening"], jax.tree.map(lambda x: x[0], batch.support)
+        )
+        clipped = np.abs(jax.flatten_util.ravel_pytree(inner)[0]) > config["inner_clip"]
+        assert 0.05 < clipped.mean() < 0.95
+
+    learned = {name: value for name, value in params.items() if name != "whitening"}
+    rng, epsilon = np.random.default_rng(3), 1e-6
+    for name in [*learned, *learned, *learned]:
+        direction = jax.tree.map(lambda x: rng.standard_normal(x.shape), learned[name])
+
+        def shifted(by, name=name, direction=direction):
+            return loss({**params, name: jax.tree.map(lambda x, d: x + by * d, params[name], direction)})
+
+        slope = (shifted(epsilon) - shifted(-epsilon)) / (2 * epsilon)
+        expected = sum(jax.tree.leaves(jax.tree.map(jnp.vdot, gradient[name], direction)))
+        assert abs(slope) > 1e-4
+        np.testing.assert_allclose(expected, slope, rtol=1e-5, err_msg=name)
+
+
+def test_first_order_gradient_is_the_query_gradient_at_the_adapted_parameters(batch):
+    method, params = build(inner_steps=2, first_order=True, learn_inner_lr=True)
+    full, _ = build(inner_steps=2, learn_inner_lr=True)
+
+    def query_gradient(support, query):
+        adapted = method.adapt(params, support)
+        return jax.grad(method.imitation_loss, has_aux=True)(adapted["policy"], adapted["whitening"], query)[0]
+
+    expected = jax.tree.map(lambda g: g.mean(axis=0), jax.jit(jax.vmap(query_gradient))(batch.support, batch.query))
+    gradient, second_order = (
+        jax.jit(jax.grad(lambda params, m=m: m.loss(params, batch)[0]))(params) for m in (method, full)
+    )
+    assert_trees_close(gradient["policy"], expected, rtol=1e-9, atol=1e-12)
+    change = optax.global_norm(difference(second_order["policy"], expected)) / optax.global_norm(expected)
+    assert change > 0.01, "second derivatives matter here"
+
+
+def test_no_gradient_reaches_the_whitening_and_adam_leaves_it(batch):
+    method, params = build()
+    gradient = jax.jit(jax.grad(lambda params: method.loss(params, batch)[0]))(params)
+    assert optax.global_norm(gradient["policy"]) > 0.01
+    optimizer = optax.adam(1e-3)
+    updates, _ = optimizer.update(gradient, optimizer.init(params), params)
+    after = optax.apply_updates(params, updates)
+    for name, value in dataclasses.asdict(params["whitening"]).items():
+        np.testing.assert_array_equal(getattr(gradient["whitening"], name), 0)
+        np.testing.assert_array_equal(getattr(after["whitening"], name), value)
+
+
+# A policy whose action is its parameter: everything has a closed form.
+#
+# With m the loss scale, A the size of the action, a and b the whitened support's and query's mean actions, an inner
+# gradient is 2 m^2 / A (theta - a), so that n steps shrink theta - a by c^n with c = 1 - 2 alpha m^2 / A.
+
+CONSTANT = PolicyNetwork(
+    init=lambda key: jnp.zeros(ACTION),
+    apply=lambda theta, image, state: PolicyOutput(*[jnp.broadcast_to(theta, (len(state), ACTION))] * 2, goal=None),
+)
+THETA = np.array([0.4, -1.3])
+ALPHA, M = 0.1, 1.7
+SLOPE = 2 * M**2 / ACTION
+
+
+def constant_mil(**config):
+    return MIL(MILConfig(**{"inner_lr": ALPHA, "loss_scale": M, "inner_clip": NO_CLIP} | config), CONSTANT)
+
+
+@pytest.fixture(scope="module")
+def constant_case(batch):
+    """Parameters, the batch without images, and the mean whitened actions of support and query [TASKS, A]."""
+    whitening = random_whitening(np.random.default_rng(4))
+    support, query = (dataclasses.replace(demo, image=None) for demo in (batch.support, batch.query))
+    a, b = ((x.action.mean(axis=(1, 2)) - whitening.action_mean) / whitening.action_scale for x in (support, query))
+    params = {"policy": jnp.asarray(THETA), "whitening": whitening}
+    return params, TaskBatch(support, query), np.asarray(a), np.asarray(b)
+
+
+@pytest.mark.parametrize("steps", [1, 2, 5])
+@pytest.mark.parametrize("first_order", [False, True])
+def test_closed_form_of_the_meta_gradient(constant_case, steps, first_order):
+    params, batch, a, b = constant_case
+    method = constant_mil(inner_steps=steps, first_order=first_order)
+    shrink = (1 - ALPHA * SLOPE) ** steps
+    adapted = a + shrink * (THETA - a)
+    one = jax.tree.map(lambda x: x[0], batch.support)
+    np.testing.assert_allclose(method.adapt(params, one)["policy"], adapted[0], rtol=1e-12)
+
+    (loss, metrics), gradient = jax.value_and_grad(method.loss, has_aux=True)(params, batch)
+    action = params["whitening"].action(np.asarray(batch.query.action))
+    expected = np.mean(M**2 * (adapted[:, None, None] - action) ** 2)
+    np.testing.assert_allclose(loss, expected, rtol=1e-12)
+    np.testing.assert_allclose(metrics["action_loss"], expected, rtol=1e-12)
+    factor = 1 if first_order else shrink
+    np.testing.assert_allclose(gradient["policy"], factor * SLOPE * (adapted - b).mean(axis=0), rtol=1e-11)
+
+
+@pytest.mark.parametrize("first_order", [False, True])
+def test_closed_form_of_the_learned_rates_gradient(constant_case, first_order):
+    params, batch, a, b = constant_case
+    s = 0.3
+    params = {**params, "inner_log_lr": jnp.asarray(s)}
+    method = constant_mil(learn_inner_lr=True, first_order=first_order)
+    step = -ALPHA * np.exp(s) * SLOPE * (THETA - a)
+    gradient = jax.grad(lambda params: method.loss(params, batch)[0])(params)
+    expected = np.mean(np.sum(SLOPE * (THETA + step - b) * step, axis=-1))
+    np.testing.assert_allclose(gradient["inner_log_lr"], expected, rtol=1e-11)
+
+
+def test_closed_form_of_the_clipped_step(constant_case):
+    """Where the clip holds, the step is alpha times the clip and no longer depends on theta: the factor is one."""
+    params, batch, a, b = constant_case
+    inner = SLOPE * (THETA - a)
+    clip = float(np.median(np.abs(inner)))
+    method = constant_mil(inner_clip=clip)
+    held = np.abs(inner) > clip
+    assert 0 < held.sum() < held.size
+    adapted = np.where(held, THETA - ALPHA * clip * np.sign(inner), THETA - ALPHA * inner)
+    found = jax.vmap(lambda support: method.adapt(params, support)["policy"])(batch.support)
+    np.testing.assert_allclose(found, adapted, rtol=1e-12)
+    gradient = jax.grad(lambda params: method.loss(params, batch)[0])(params)
+    # At the median itself, which is an entry, the clip is about to hold; its task gets no say.
+    boundary = np.isclose(np.abs(inner), clip)
+    expected = np.where(held, 1, 1 - ALPHA * SLOPE) * SLOPE * (adapted - b)
+    columns = ~boundary.any(axis=0)
+    assert columns.any()
+    np.testing.assert_allclose(gradient["policy"][columns], expected.mean(axis=0)[columns], rtol=1e-11)
+
+
+def test_goal_head_predicts_the_last_state_of_each_demonstration(batch):
+    network = PolicyNetwork(
+        init=CONSTANT.init,
+        apply=lambda theta, image, state: CONSTANT.apply(theta, image, state)._replace(
+            goal=jnp.broadcast_to(jnp.array([0.5, -2.0]), (len(state), 2))
+        ),
+    )
+    method = MIL(MILConfig(goal_weight=0.7), network, GOAL_INDICES)
+    whitening = random_whitening(np.random.default_rng(4))
+    demo = jax.tree.map(lambda x: x[0], batch.query)
+    loss, metrics = method.imitation_loss(jnp.asarray(THETA), whitening, demo)
+    goals = np.asarray((demo.state - whitening.state_mean) / whitening.state_scale)[:, -1, list(GOAL_INDICES)]
+    expected = np.mean((np.array([0.5, -2.0]) - goals) ** 2)
+    np.testing.assert_allclose(metrics["goal_loss"], expected, rtol=1e-12)
+    np.testing.assert_allclose(loss, metrics["action_loss"] + 0.7 * expected, rtol=1e-12)
+
+
+# Laws of the inner step.
+
+
+def test_clip_bounds_every_entry_of_the_step(batch):
+    clip = 0.05
+    support = jax.tree.map(lambda x: x[0], batch.support)
+    steps = []
+    for inner_clip in (clip, NO_CLIP):
+        method, params = build(inner_clip=inner_clip)
+        adapted = jax.jit(method.adapt)(params, support)["policy"]
+        steps.append(np.asarray(jax.flatten_util.ravel_pytree(difference(adapted, params["policy"]))[0]) / 0.05)
+    clipped, free = steps
+    np.testing.assert_allclose(clipped, np.clip(free, -clip, clip), atol=1e-13)
+    assert 0.05 < np.mean(np.abs(free) > clip) < 0.95
+
+
+def test_with_rate_zero_the_loss_is_plain_imitation_of_the_query(batch):
+    method, params = build({"heads": 2}, inner_lr=0.0)
+    loss, _ = method.loss(params, batch)
+    plain = [
+        method.imitation_loss(params["policy"], params["whitening"], jax.tree.map(lambda x, i=i: x[i], batch.query))[0]
+        for i in range(TASKS)
+    ]
+    np.testing.assert_allclose(loss, np.mean(plain), rtol=1e-12)
+
+
+def test_a_small_step_lowers_the_inner_loss_by_its_gradients_square(batch):
+    """L(theta - alpha g) = L(theta) - alpha |g|^2 + O(alpha^2)."""
+    method, params = build({"heads": 2, "goal_head": True}, inner_lr=1e-6, goal_weight=0.7)
+    support = jax.tree.map(lambda x: x[0], batch.support)
+
+    @jax.jit
+    def inner_loss(theta):
+        return method.imitation_loss(theta, params["whitening"], support, inner=True)[0]
+
+    change = inner_loss(jax.jit(method.adapt)(params, support)["policy"]) - inner_loss(params["policy"])
+    square = optax.global_norm(jax.jit(jax.grad(inner_loss))(params["policy"])) ** 2
+    np.testing.assert_allclose(change, -1e-6 * square, rtol=1e-3)
+
+
+def test_adapt_under_vmap_equals_a_loop(batch):
+    method, params = build(inner_steps=2)
+    together = jax.jit(jax.vmap(method.adapt, in_axes=(None, 0)))(params, batch.support)["policy"]
+    adapt = jax.jit(method.adapt)
+    for i in range(TASKS):
+        alone = adapt(params, jax.tree.map(lambda x, i=i: x[i], batch.support))["policy"]
+        assert_trees_close(jax.tree.map(lambda x, i=i: x[i], together), alone, rtol=1e-9, atol=1e-12)
+
+
+def test_several_demonstrations_give_the_average_of_their_steps():
+    method, params = build({"goal_head": True}, learn_inner_lr=True, goal_weight=0.7)
+    demos = random_demos(np.random.default_rng(5), 3)
+    adapt = jax.jit(method.adapt)
+    together = difference(adapt(params, demos)["policy"], params["policy"])
+    steps = [
+        difference(adapt(params, jax.tree.map(lambda x, k=k: x[k : k + 1], demos))["policy"], params["policy"])
+        for k in range(3)
+    ]
+    assert_trees_close(together, jax.tree.map(lambda *x: sum(x) / 3, *steps), rtol=1e-9, atol=1e-13)
+
+
+def test_with_two_heads_the_inner_step_leaves_the_head_that_acts(batch):
+    support = jax.tree.map(lambda x: x[0], batch.support)
+    moved = {}
+    for heads in (1, 2):
+        method, params = build({"heads": heads})
+        step = difference(jax.jit(method.adapt)(params, support)["policy"], params["policy"])
+        moved[heads] = {layer: float(optax.global_norm(part)) for layer, part in step.items()}
+    assert moved[2].pop("Dense_2") == 0, "the last layer before the action"
+    for heads in (1, 2):
+        assert min(moved[heads].values()) > 1e-4, moved[heads]
+
+
+# Acting.
+
+
+def test_imitating_its_own_actions_is_without_loss(batch):
+    """`act` undoes the whitening that the loss applies, and uses the head that the outer loss trains."""
+    method, params = build({"heads": 2})
+    task_params = jax.jit(method.adapt)(params, jax.tree.map(lambda x: x[0], batch.support))
+    demo = jax.tree.map(lambda x: x[0], batch.query)
+    act = jax.vmap(jax.vmap(lambda image, state: method.act(task_params, Observation(image, state), ())[0]))
+    own = dataclasses.replace(demo, action=jax.jit(act)(demo.image, demo.state))
+    assert np.abs(own.action - demo.action).max() > 0.1
+    for inner, law in ((False, lambda loss: loss < 1e-20), (True, lambda loss: loss > 1e-3)):
+        loss, _ = method.imitation_loss(task_params["policy"], task_params["whitening"], own, inner=inner)
+        assert law(loss), (inner, loss)
+
+
+def test_an_unknown_method_is_told_the_known_ones():
+    spec = methods.Spec(IMAGE_SHAPE, STATE, ACTION, GOAL_INDICES)
+    with pytest.raises(ValueError, match="method: got 'maml', expected one of mil"):
+        methods.make(Config(method_name="maml"), spec)

@@ -1,0 +1,136 @@
+"""Layers against `jax.lax`, closed forms and their laws."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from milx.networks import layers
+
+
+@pytest.fixture(autouse=True, scope="module")
+def float64():
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(0)
+
+
+# Convolution.
+
+
+def reference_conv2d(x, kernel, stride):
+    return jax.lax.conv_general_dilated(
+        x, kernel, (stride, stride), padding="SAME", dimension_numbers=("NHWC", "HWIO", "NHWC")
+    )
+
+
+@functools.partial(jax.jit, static_argnums=(0, 3))
+def derivatives(conv, inputs, directions, stride):
+    """Values, gradient and Hessian-vector product of a cubic function of a convolution of (x, kernel)."""
+
+    def cubed(inputs):
+        return jnp.sum(conv(*inputs, stride) ** 3)
+
+    gradient, product = jax.jvp(jax.grad(cubed), (inputs,), (directions,))
+    return conv(*inputs, stride), gradient, product
+
+
+@pytest.mark.parametrize("shape", [(8, 10), (7, 9), (5, 8)])
+@pytest.mark.parametrize("kernel", [3, 5])
+@pytest.mark.parametrize("stride", [1, 2])
+def test_conv2d_and_its_derivatives_are_those_of_lax(rng, shape, kernel, stride):
+    sizes = ((2, *shape, 3), (kernel, kernel, 3, 4))
+    inputs, directions = (tuple(rng.standard_normal(size) for size in sizes) for _ in range(2))
+    found = derivatives(layers.conv2d, inputs, directions, stride)
+    expected = derivatives(reference_conv2d, inputs, directions, stride)
+    for name, ours, theirs in zip(["value", "gradient", "Hessian-vector product"], found, expected, strict=True):
+        jax.tree.map(
+            lambda a, b, name=name: np.testing.assert_allclose(
+                a, b, rtol=0, atol=1e-10 * np.abs(b).max(), err_msg=name
+            ),
+            ours,
+            theirs,
+        )
+
+
+def test_conv2d_with_every_tasks_own_kernel_is_a_loop_of_lax(rng):
+    x, kernel = rng.standard_normal((5, 2, 8, 9, 3)), rng.standard_normal((5, 3, 3, 3, 4))
+    found = jax.vmap(lambda x, kernel: layers.conv2d(x, kernel, 2))(x, kernel)
+    expected = [reference_conv2d(x[i], kernel[i], 2) for i in range(5)]
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
+# Spatial soft-argmax.
+
+
+def test_soft_argmax_of_a_sharp_peak_is_its_position():
+    height, width = 5, 7
+    for i, j in [(0, 0), (4, 6), (1, 5), (2, 3)]:
+        features = np.zeros((1, height, width, 2))
+        features[0, i, j, 0] = 50.0
+        features[0, height - 1 - i, width - 1 - j, 1] = 50.0
+        x, y = -1 + 2 * j / (width - 1), -1 + 2 * i / (height - 1)
+        found = layers.spatial_soft_argmax(jnp.asarray(features), jnp.ones(2))
+        # The 34 other pixels together have weight 34 exp(-50).
+        np.testing.assert_allclose(found, [[x, -x, y, -y]], atol=1e-12)
+
+
+def test_soft_argmax_of_a_uniform_image_is_the_middle():
+    features = np.broadcast_to([3.0, -1.0, 0.0], (2, 6, 9, 3))
+    np.testing.assert_allclose(layers.spatial_soft_argmax(jnp.asarray(features), jnp.ones(3)), 0, atol=1e-15)
+
+
+def test_soft_argmax_moves_with_the_image(rng):
+    """A blob on a zero image whose weight exp(0) is negligible: one pixel further is 2 / (size - 1) further."""
+    height, width = 12, 14
+    features = np.zeros((1, height, width, 4))
+    features[0, 3:7, 2:6] = rng.uniform(60, 63, (4, 4, 4))
+    moved = np.roll(features, (4, 6), axis=(1, 2))
+    before, after = (layers.spatial_soft_argmax(jnp.asarray(f), jnp.ones(4)) for f in (features, moved))
+    shift = np.repeat([6 * 2 / (width - 1), 4 * 2 / (height - 1)], 4)
+    np.testing.assert_allclose(after - before, shift[None], atol=1e-12)
+    assert np.ptp(before[0, :4]) > 0.01, "the blobs of the channels differ"
+
+
+def test_soft_argmax_divides_by_the_temperature_of_each_channel(rng):
+    features, temperature = rng.standard_normal((2, 5, 6, 3)), np.array([0.1, 1.0, 7.0])
+    found = layers.spatial_soft_argmax(jnp.asarray(features), jnp.asarray(temperature))
+    weights = np.exp(features / temperature)
+    weights /= weights.sum(axis=(1, 2), keepdims=True)
+    x = np.einsum("bhwc,w->bc", weights, np.linspace(-1, 1, 6))
+    y = np.einsum("bhwc,h->bc", weights, np.linspace(-1, 1, 5))
+    np.testing.assert_allclose(found, np.concatenate([x, y], axis=-1), atol=1e-12)
+
+
+# Layer norm.
+
+
+@pytest.mark.parametrize("shape", [(3, 4, 5, 6), (3, 20)])
+def test_layer_norm_has_zero_mean_and_unit_variance_before_its_centre(rng, shape):
+    scale = np.array([0.5, 10.0, 300.0]).reshape(-1, *[1] * (len(shape) - 1))
+    x, bias = scale * (rng.standard_normal(shape) + 3), rng.standard_normal(shape[-1])
+    axes = tuple(range(1, len(shape)))
+    found = np.asarray(layers.centred_layer_norm(jnp.asarray(x), jnp.asarray(bias))) - bias
+    np.testing.assert_allclose(found.mean(axes), 0, atol=1e-12)
+    # 1e-6 is added to the variance.
+    variance = x.var(axes)
+    np.testing.assert_allclose(found.var(axes), variance / (variance + 1e-6), rtol=1e-12)
+    # It is an increasing affine map of each example.
+    np.testing.assert_allclose(
+        found * np.sqrt(x.var(axes, keepdims=True) + 1e-6), x - x.mean(axes, keepdims=True), atol=1e-9
+    )
+
+
+def test_layer_norm_of_a_constant_image_is_its_centre_and_has_finite_gradients():
+    bias = jnp.array([1.0, -2.0])
+    found, gradient = jax.value_and_grad(lambda x: jnp.sum(layers.centred_layer_norm(x, bias) ** 3))(
+        jnp.full((2, 3, 4, 2), 7.0)
+    )
+    assert found == pytest.approx(2 * 3 * 4 * (1 - 8))
+    assert np.isfinite(gradient).all()

@@ -1,0 +1,113 @@
+"""The policy network: what its parts promise the methods."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from milx.config import NetworkConfig
+from milx.networks.policy import make_policy
+
+IMAGE_SHAPE, STATE, ACTION, GOAL, BATCH = (8, 10), 3, 2, 2, 6
+TINY = {"filters": (4, 4), "strides": (2, 2), "fc_layers": (8,), "bias_transformation": 5}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def float64():
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.fixture(scope="module")
+def inputs():
+    rng = np.random.default_rng(0)
+    image = rng.integers(0, 256, (BATCH, *IMAGE_SHAPE, 3), dtype=np.uint8)
+    return jnp.asarray(image), jnp.asarray(rng.standard_normal((BATCH, STATE)))
+
+
+def build(**changes):
+    """A tiny network, and parameters that are nowhere zero."""
+    network = make_policy(NetworkConfig(**TINY | changes), IMAGE_SHAPE, STATE, ACTION, GOAL)
+    leaves, tree = jax.tree.flatten(network.init(jax.random.key(0)))
+    rng = np.random.default_rng(1)
+    return network, jax.tree.unflatten(tree, [leaf + 0.3 * rng.standard_normal(leaf.shape) for leaf in leaves])
+
+
+def test_bias_transformation_gives_the_first_bias_a_learned_step(inputs):
+    """Paper, Section 4.1: with z the vector and W_2 its rows of the first layer, the bias is W_2 z + b.
+
+    A gradient step of rate alpha on (z, W_2) moves that bias by -alpha (W_2 W_2^T + |z|^2) g + alpha^2 (...), where g is
+    the loss's gradient by b: a matrix that is learned, where b alone would move by -alpha g.
+    """
+    network, params = build()
+
+    def loss(params):
+        return jnp.sum(jnp.sin(network.apply(params, *inputs).action))
+
+    gradient = jax.grad(loss)(params)
+    z, W = params["bias_transformation"], params["Dense_0"]["kernel"][-5:]
+    dz, dW, g = gradient["bias_transformation"], gradient["Dense_0"]["kernel"][-5:], gradient["Dense_0"]["bias"]
+    assert np.abs(g).min() > 1e-3 * np.abs(g).max() or np.count_nonzero(g) > 2
+    np.testing.assert_allclose(dz, W @ g, atol=1e-12)
+    np.testing.assert_allclose(dW, jnp.outer(z, g), atol=1e-12)
+
+    alpha = 1e-3
+    moved = (z - alpha * dz) @ (W - alpha * dW) - z @ W
+    step = -alpha * (W.T @ W + z @ z * jnp.eye(len(g))) @ g
+    second_order = alpha**2 * (dz @ dW)
+    np.testing.assert_allclose(moved, step + second_order, atol=1e-14)
+
+    # The network sees no more of (z, W_2) than that bias.
+    folded = {**params, "bias_transformation": jnp.zeros(5)}
+    folded["Dense_0"] = {**params["Dense_0"], "bias": params["Dense_0"]["bias"] + z @ W}
+    np.testing.assert_allclose(network.apply(folded, *inputs).action, network.apply(params, *inputs).action, rtol=1e-12)
+
+
+def test_without_bias_transformation_nothing_of_it_is_left(inputs):
+    network, params = build(bias_transformation=0)
+    wide, wide_params = build()
+    width = wide_params["Dense_0"]["kernel"].shape[0] - params["Dense_0"]["kernel"].shape[0]
+    assert width == 5
+    # A zero vector is as good as none.
+    wide_params = {**params, "bias_transformation": jnp.zeros(5), "Dense_0": dict(params["Dense_0"])}
+    wide_params["Dense_0"]["kernel"] = jnp.concatenate([params["Dense_0"]["kernel"], jnp.ones((5, 8))])
+    np.testing.assert_allclose(wide.apply(wide_params, *inputs).action, network.apply(params, *inputs).action)
+
+
+@pytest.mark.parametrize("changes", [{}, {"soft_argmax": True, "goal_head": True}])
+def test_examples_of_a_batch_do_not_see_each_other(inputs, changes):
+    """Layer norm, unlike batch norm, acts within an example: a batch is a loop over its examples."""
+    network, params = build(**changes)
+    together = network.apply(params, *inputs)
+    for i in range(BATCH):
+        alone = network.apply(params, *(x[i : i + 1] for x in inputs))
+        jax.tree.map(lambda a, b, i=i: np.testing.assert_allclose(a[0], b[i], rtol=1e-9), alone, together)
+    assert np.abs(np.diff(together.action, axis=0)).min() > 1e-6
+
+
+def test_one_head_answers_both_losses_and_two_heads_share_all_but_the_last_layer(inputs):
+    network, params = build()
+    output = network.apply(params, *inputs)
+    np.testing.assert_array_equal(output.action, output.inner_action)
+
+    network, params = build(heads=2)
+    output = network.apply(params, *inputs)
+    swapped = {**params, "Dense_1": params["Dense_2"], "Dense_2": params["Dense_1"]}
+    np.testing.assert_array_equal(network.apply(swapped, *inputs).action, output.inner_action)
+    np.testing.assert_array_equal(network.apply(swapped, *inputs).inner_action, output.action)
+    assert np.abs(output.action - output.inner_action).min() > 1e-6
+
+
+def test_the_prediction_of_the_goal_reaches_the_action(inputs):
+    network, params = build(goal_head=True)
+    goal_layer = params["Dense_0"]
+    np.testing.assert_array_equal(goal_layer["bias"].shape, (GOAL,))
+    # Whatever the layer predicts is appended to the input of the next: a bias there acts through its rows.
+    shift = jnp.array([0.3, -0.7])
+    moved = {**params, "Dense_0": {**goal_layer, "bias": goal_layer["bias"] + shift}}
+    first = params["Dense_1"]
+    folded = {**params, "Dense_1": {**first, "bias": first["bias"] + shift @ first["kernel"][-GOAL:]}}
+    plain, moved, folded = (network.apply(p, *inputs) for p in (params, moved, folded))
+    np.testing.assert_allclose(moved.goal, plain.goal + shift, rtol=1e-12)
+    np.testing.assert_allclose(moved.action, folded.action, rtol=1e-9)
+    assert np.abs(moved.action - plain.action).max() > 1e-3
