@@ -37,7 +37,7 @@ class DataConfig:
     demos_per_task: int = 10
     noise: float = 0.01
     plan_iterations: int = 16
-    plan_batch: int = 16384
+    plan_batch: int = 4096
 
 
 @dataclasses.dataclass
