@@ -71,8 +71,10 @@ def build(network=None, **config):
     return MIL(MILConfig(**{"inner_lr": 0.05, "inner_clip": NO_CLIP} | config), policy, GOAL_INDICES), params
 
 
-def assert_trees_close(found, expected, **tolerance):
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, **tolerance), found, expected)
+def assert_trees_close(found, expected):
+    """Equal up to 1e-6 of each tensor's largest entry: images enter in float32, which two programs may round apart."""
+    close = lambda a, b: np.testing.assert_allclose(a, b, rtol=0, atol=1e-6 * np.abs(b).max())  # noqa: E731
+    jax.tree.map(close, found, expected)
 
 
 def difference(after, before):
@@ -95,8 +97,8 @@ VARIANTS = {
 def test_meta_gradient_is_that_of_finite_differences(batch, variant):
     network, config = VARIANTS[variant]
     method, params = build(network, **config)
-    loss = jax.jit(lambda params: method.loss(params, batch)[0])
-    gradient = jax.jit(jax.grad(loss))(params)
+    loss = jax.jit(jax.value_and_grad(lambda params: method.loss(params, batch)[0]))
+    _, gradient = loss(params)
     if config.get("inner_clip"):
         inner, _ = jax.jit(jax.grad(method.imitation_loss, has_aux=True))(
             params["policy"], params["whitening"], jax.tree.map(lambda x: x[0], batch.support)
@@ -110,7 +112,7 @@ def test_meta_gradient_is_that_of_finite_differences(batch, variant):
         direction = jax.tree.map(lambda x: rng.standard_normal(x.shape), learned[name])
 
         def shifted(by, name=name, direction=direction):
-            return loss({**params, name: jax.tree.map(lambda x, d: x + by * d, params[name], direction)})
+            return loss({**params, name: jax.tree.map(lambda x, d: x + by * d, params[name], direction)})[0]
 
         slope = (shifted(epsilon) - shifted(-epsilon)) / (2 * epsilon)
         expected = sum(jax.tree.leaves(jax.tree.map(jnp.vdot, gradient[name], direction)))
@@ -130,15 +132,15 @@ def test_first_order_gradient_is_the_query_gradient_at_the_adapted_parameters(ba
     gradient, second_order = (
         jax.jit(jax.grad(lambda params, m=m: m.loss(params, batch)[0]))(params) for m in (method, full)
     )
-    assert_trees_close(gradient["policy"], expected, rtol=1e-9, atol=1e-12)
-    change = optax.global_norm(difference(second_order["policy"], expected)) / optax.global_norm(expected)
+    assert_trees_close(gradient["policy"], expected)
+    change = optax.tree.norm(difference(second_order["policy"], expected)) / optax.tree.norm(expected)
     assert change > 0.01, "second derivatives matter here"
 
 
 def test_no_gradient_reaches_the_whitening_and_adam_leaves_it(batch):
     method, params = build()
     gradient = jax.jit(jax.grad(lambda params: method.loss(params, batch)[0]))(params)
-    assert optax.global_norm(gradient["policy"]) > 0.01
+    assert optax.tree.norm(gradient["policy"]) > 0.01
     optimizer = optax.adam(1e-3)
     updates, _ = optimizer.update(gradient, optimizer.init(params), params)
     after = optax.apply_updates(params, updates)
@@ -213,17 +215,13 @@ def test_closed_form_of_the_clipped_step(constant_case):
     clip = float(np.median(np.abs(inner)))
     method = constant_mil(inner_clip=clip)
     held = np.abs(inner) > clip
-    assert 0 < held.sum() < held.size
+    assert held.sum() == held.size / 2
     adapted = np.where(held, THETA - ALPHA * clip * np.sign(inner), THETA - ALPHA * inner)
     found = jax.vmap(lambda support: method.adapt(params, support)["policy"])(batch.support)
     np.testing.assert_allclose(found, adapted, rtol=1e-12)
     gradient = jax.grad(lambda params: method.loss(params, batch)[0])(params)
-    # At the median itself, which is an entry, the clip is about to hold; its task gets no say.
-    boundary = np.isclose(np.abs(inner), clip)
     expected = np.where(held, 1, 1 - ALPHA * SLOPE) * SLOPE * (adapted - b)
-    columns = ~boundary.any(axis=0)
-    assert columns.any()
-    np.testing.assert_allclose(gradient["policy"][columns], expected.mean(axis=0)[columns], rtol=1e-11)
+    np.testing.assert_allclose(gradient["policy"], expected.mean(axis=0), rtol=1e-11)
 
 
 def test_goal_head_predicts_the_last_state_of_each_demonstration(batch):
@@ -255,18 +253,19 @@ def test_clip_bounds_every_entry_of_the_step(batch):
         adapted = jax.jit(method.adapt)(params, support)["policy"]
         steps.append(np.asarray(jax.flatten_util.ravel_pytree(difference(adapted, params["policy"]))[0]) / 0.05)
     clipped, free = steps
-    np.testing.assert_allclose(clipped, np.clip(free, -clip, clip), atol=1e-13)
+    np.testing.assert_allclose(clipped, np.clip(free, -clip, clip), atol=1e-7)
     assert 0.05 < np.mean(np.abs(free) > clip) < 0.95
 
 
 def test_with_rate_zero_the_loss_is_plain_imitation_of_the_query(batch):
     method, params = build({"heads": 2}, inner_lr=0.0)
-    loss, _ = method.loss(params, batch)
+    loss, _ = jax.jit(method.loss)(params, batch)
+    imitate = jax.jit(method.imitation_loss)
     plain = [
-        method.imitation_loss(params["policy"], params["whitening"], jax.tree.map(lambda x, i=i: x[i], batch.query))[0]
+        imitate(params["policy"], params["whitening"], jax.tree.map(lambda x, i=i: x[i], batch.query))[0]
         for i in range(TASKS)
     ]
-    np.testing.assert_allclose(loss, np.mean(plain), rtol=1e-12)
+    np.testing.assert_allclose(loss, np.mean(plain), rtol=1e-6)
 
 
 def test_a_small_step_lowers_the_inner_loss_by_its_gradients_square(batch):
@@ -279,7 +278,7 @@ def test_a_small_step_lowers_the_inner_loss_by_its_gradients_square(batch):
         return method.imitation_loss(theta, params["whitening"], support, inner=True)[0]
 
     change = inner_loss(jax.jit(method.adapt)(params, support)["policy"]) - inner_loss(params["policy"])
-    square = optax.global_norm(jax.jit(jax.grad(inner_loss))(params["policy"])) ** 2
+    square = optax.tree.norm(jax.jit(jax.grad(inner_loss))(params["policy"])) ** 2
     np.testing.assert_allclose(change, -1e-6 * square, rtol=1e-3)
 
 
@@ -289,7 +288,7 @@ def test_adapt_under_vmap_equals_a_loop(batch):
     adapt = jax.jit(method.adapt)
     for i in range(TASKS):
         alone = adapt(params, jax.tree.map(lambda x, i=i: x[i], batch.support))["policy"]
-        assert_trees_close(jax.tree.map(lambda x, i=i: x[i], together), alone, rtol=1e-9, atol=1e-12)
+        assert_trees_close(jax.tree.map(lambda x, i=i: x[i], together), alone)
 
 
 def test_several_demonstrations_give_the_average_of_their_steps():
@@ -301,7 +300,7 @@ def test_several_demonstrations_give_the_average_of_their_steps():
         difference(adapt(params, jax.tree.map(lambda x, k=k: x[k : k + 1], demos))["policy"], params["policy"])
         for k in range(3)
     ]
-    assert_trees_close(together, jax.tree.map(lambda *x: sum(x) / 3, *steps), rtol=1e-9, atol=1e-13)
+    assert_trees_close(together, jax.tree.map(lambda *x: sum(x) / 3, *steps))
 
 
 def test_with_two_heads_the_inner_step_leaves_the_head_that_acts(batch):
@@ -310,7 +309,7 @@ def test_with_two_heads_the_inner_step_leaves_the_head_that_acts(batch):
     for heads in (1, 2):
         method, params = build({"heads": heads})
         step = difference(jax.jit(method.adapt)(params, support)["policy"], params["policy"])
-        moved[heads] = {layer: float(optax.global_norm(part)) for layer, part in step.items()}
+        moved[heads] = {layer: float(optax.tree.norm(part)) for layer, part in step.items()}
     assert moved[2].pop("Dense_2") == 0, "the last layer before the action"
     for heads in (1, 2):
         assert min(moved[heads].values()) > 1e-4, moved[heads]
@@ -327,9 +326,9 @@ def test_imitating_its_own_actions_is_without_loss(batch):
     act = jax.vmap(jax.vmap(lambda image, state: method.act(task_params, Observation(image, state), ())[0]))
     own = dataclasses.replace(demo, action=jax.jit(act)(demo.image, demo.state))
     assert np.abs(own.action - demo.action).max() > 0.1
-    for inner, law in ((False, lambda loss: loss < 1e-20), (True, lambda loss: loss > 1e-3)):
+    for inner, law in ((False, lambda loss: loss < 1e-12), (True, lambda loss: loss > 1e-3)):
         loss, _ = method.imitation_loss(task_params["policy"], task_params["whitening"], own, inner=inner)
-        assert law(loss), (inner, loss)
+        assert law(loss), f"inner {inner}: {loss}"
 
 
 def test_an_unknown_method_is_told_the_known_ones():

@@ -1,0 +1,74 @@
+"""One tiny run, planned, trained and evaluated once a session; tests of its parts look at what it left."""
+
+import dataclasses
+import json
+import os
+import pathlib
+from typing import Any
+
+import jax
+import pytest
+from rich.console import Console
+
+from milx.config import Config, make_config
+from milx.data.demos import DemoSet
+from milx.run import Run
+
+QUIET = Console(quiet=True)
+
+
+def tiny_config(seed: int = 0) -> Config:
+    """Sizes at which compiling takes far longer than running."""
+    config = make_config("reach", preset="cpu", seed=seed)
+    config.data.tasks, config.data.demos_per_task = 8, 3
+    config.data.plan_iterations, config.data.plan_batch = 3, 24
+    config.network.filters, config.network.strides, config.network.fc_layers = (4, 4), (2, 2), (16,)
+    config.train.steps, config.train.log_every, config.train.eval_every = 6, 2, 2
+    config.train.meta_batch, config.train.support_frames, config.train.query_frames = 2, 3, 3
+    config.evaluation.validation_tasks, config.evaluation.tasks = 3, 3
+    config.evaluation.trials, config.evaluation.batch = 2, 3
+    return config
+
+
+@dataclasses.dataclass(frozen=True)
+class Trained:
+    """A finished run, and the demonstrations that it used."""
+
+    run: Run
+    result: dict[str, Any]
+    train: DemoSet
+    validation: DemoSet
+    test: DemoSet
+
+    @property
+    def folder(self) -> pathlib.Path:
+        return self.run.folder
+
+    @property
+    def config(self) -> Config:
+        return self.run.config
+
+    @property
+    def metrics(self) -> list[dict[str, Any]]:
+        return [json.loads(line) for line in (self.folder / "metrics.jsonl").read_text().splitlines()]
+
+
+@pytest.fixture(scope="session", autouse=True)
+def cache(tmp_path_factory):
+    """Demonstrations are cached for this session only; compiled programs stay where milx puts them.
+
+    Both hold for processes that tests start, too.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        folder = tmp_path_factory.mktemp("cache")
+        patch.setenv("JAX_COMPILATION_CACHE_DIR", os.fspath(jax.config.jax_compilation_cache_dir))
+        patch.setenv("XDG_CACHE_HOME", str(folder))
+        yield folder
+
+
+@pytest.fixture(scope="session")
+def trained(cache, tmp_path_factory) -> Trained:
+    run = Run(tiny_config(), tmp_path_factory.mktemp("run"), QUIET)
+    run.train()
+    result = run.evaluate()
+    return Trained(run, result, *(run.demos(split) for split in ("train", "validation", "test")))

@@ -1,0 +1,91 @@
+"""Configurations: to JSON and back, presets, and what is said about names that do not exist."""
+
+import json
+import re
+
+import pytest
+
+from milx import config as config_lib
+from milx import methods
+from milx.config import PRESETS, Config, make_config
+from milx.methods import Spec
+
+ALL = [(env, preset) for env, presets in PRESETS.items() for preset in presets]
+
+
+@pytest.mark.parametrize(("env", "preset"), ALL)
+def test_json_and_back(env, preset):
+    config = make_config(env, "mil", preset, seed=3)
+    config.train.support_frames = None
+    config.network.filters = (5, 6, 7)
+    config.optimizer.clip_norm = 0.125
+    again = config_lib.from_dict(json.loads(json.dumps(config_lib.to_dict(config))))
+    assert again == config
+    assert isinstance(again.network.filters, tuple)
+    assert config_lib.differences(config_lib.to_dict(config), config_lib.to_dict(again)) == []
+
+
+@pytest.mark.parametrize(("env", "preset"), ALL)
+def test_presets_carry_their_names_and_share_nothing(env, preset):
+    config = make_config(env, "mil", preset, seed=3)
+    assert (config.env_name, config.method_name, config.preset, config.seed) == (env, "mil", preset, 3)
+    before = make_config(env, "mil", preset)
+    config.network.filters, config.data.tasks, config.evaluation.batch = (1,), -1, -1
+    assert make_config(env, "mil", preset) == before
+    assert config.train.eval_every % config.train.log_every == config.train.steps % config.train.eval_every == 0
+
+
+def test_fields_left_out_have_their_defaults():
+    config = config_lib.from_dict({"seed": 4, "train": {"steps": 7}})
+    expected = Config(seed=4)
+    expected.train.steps = 7
+    assert config == expected
+
+
+@pytest.mark.parametrize(
+    ("values", "message", "valid"),
+    [
+        ({"nope": 1}, "config.nope: no such field", ["env_name", "seed", "train", "evaluation"]),
+        ({"train": {"stepz": 1}}, "config.train.stepz: no such field", ["steps", "meta_batch", "eval_every"]),
+    ],
+)
+def test_unknown_field_is_refused_and_the_valid_ones_listed(values, message, valid):
+    with pytest.raises(ValueError, match="^" + re.escape(message)) as error:
+        config_lib.from_dict(values)
+    listed = str(error.value).split("expected one of ")[1].split(", ")
+    assert set(valid) <= set(listed)
+    assert "nope" not in listed
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"env": "nope"}, "env: got 'nope', expected one of reach"),
+        ({"env": "reach", "preset": "nope"}, "preset: got 'nope', expected one of paper, fast, cpu"),
+    ],
+)
+def test_unknown_env_or_preset_is_refused_and_the_valid_ones_listed(arguments, message):
+    with pytest.raises(ValueError, match="^" + re.escape(message)):
+        make_config(**arguments)
+
+
+def test_unknown_method_is_refused_and_the_valid_ones_listed():
+    spec = Spec(image_shape=(8, 10), state_size=4, action_size=2, goal_indices=(0,))
+    with pytest.raises(ValueError, match=re.escape("method: got 'nope', expected one of mil")):
+        methods.make(make_config("reach", "nope"), spec)
+
+
+def test_differences_name_the_fields():
+    old, new = make_config("reach", preset="cpu"), make_config("reach", preset="cpu", seed=2)
+    new.train.meta_batch = 9
+    new.network.filters = (1, 2)
+    found = config_lib.differences(config_lib.to_dict(old), config_lib.to_dict(new))
+    assert found == [
+        "seed was 0, now 2",
+        "network.filters was (24, 24, 24), now (1, 2)",
+        "train.meta_batch was 8, now 9",
+    ]
+
+
+def test_flatten_joins_names_with_dots():
+    assert config_lib.flatten({"a": 1, "b": {"c": 2, "d": {"e": (3,)}}}) == {"a": 1, "b.c": 2, "b.d.e": (3,)}

@@ -1,0 +1,125 @@
+"""Wilson's interval, which scenes are tried, and that the size of a batch changes nothing."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.stats
+
+from milx import evaluator
+from milx import run as run_lib
+from milx.chunks import map_in_chunks
+from milx.config import EvalConfig
+from milx.methods import Method
+
+# Wilson's interval of k successes in n trials, to four digits; by hand, 0/n ends at z^2 / (n + z^2).
+KNOWN = {
+    (0, 10): (0.0, 0.2775),
+    (9, 10): (0.5958, 0.9821),
+    (10, 10): (0.7225, 1.0),
+    (5, 10): (0.2366, 0.7634),
+}
+
+
+@pytest.mark.parametrize(("successes", "trials"), KNOWN)
+def test_wilson_interval_against_known_values(successes, trials):
+    np.testing.assert_allclose(evaluator.wilson_interval(successes, trials), KNOWN[successes, trials], atol=5e-5)
+
+
+@pytest.mark.parametrize("trials", [1, 7, 150, 1500])
+def test_wilson_interval_against_scipy(trials):
+    for successes in {0, 1, trials // 3, trials - 1, trials}:
+        expected = scipy.stats.binomtest(successes, trials).proportion_ci(method="wilson")
+        low, high = evaluator.wilson_interval(successes, trials)
+        np.testing.assert_allclose((low, high), (expected.low, expected.high), atol=1e-7)
+        assert 0 <= low <= successes / trials <= high <= 1
+
+
+def test_summary_counts_trials():
+    table = jnp.array([[True, False, True], [False, False, True]])
+    found = evaluator.summary(table)
+    assert (found["trials"], found["success"]) == (6, 0.5)
+    assert found["wilson95"] == list(evaluator.wilson_interval(3, 6))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Replay(Method):
+    """Repeats the first demonstration's actions, whatever it sees: the memory counts the steps."""
+
+    def init(self, key, whitening):
+        return ()
+
+    def loss(self, params, batch):
+        raise NotImplementedError
+
+    def adapt(self, params, demo):
+        return demo.action[0]
+
+    def act(self, task_params, observation, memory):
+        return task_params[memory], memory + 1
+
+    def initial_memory(self, key):
+        return jnp.zeros((), jnp.int32)
+
+
+def test_table_is_the_same_for_batches_of_two_and_three(trained):
+    env, method = trained.run.env, Replay()
+    key = jax.random.key(5)
+    config = EvalConfig(trials=24, shots=1, batch=3)
+    three = evaluator.success_table(env, method, (), trained.test, config, key)
+    two = evaluator.success_table(env, method, (), trained.test, dataclasses.replace(config, batch=2), key)
+    assert three.shape == (3, 24)
+    assert 0 < three.mean() < 1, "replay succeeds by luck in some scenes"
+    np.testing.assert_array_equal(two, three)
+
+
+@pytest.mark.parametrize("split", ["validation", "test"])
+def test_no_trial_takes_place_in_the_demonstration_s_scene(trained, split, monkeypatch):
+    demos = getattr(trained, split)
+    # What a trial is given: its scene, and the demonstration that the policy adapts to.
+    monkeypatch.setattr(
+        evaluator, "_success", lambda env, method, params, task, states, action, scene, key: (scene, states, action)
+    )
+    config = dataclasses.replace(trained.config.evaluation, trials=10)
+    key = run_lib._trial_key(split)
+    scene, states, action = evaluator.success_table(trained.run.env, trained.run.method, (), demos, config, key)
+    np.testing.assert_array_equal(action, demos.action[:, :1])
+    cubes, shown = np.asarray(scene.mocap_pos), np.asarray(states.mocap_pos[:, :, 0])
+    assert cubes.shape == (3, 10, 3, 3)
+    apart = np.abs(cubes[:, :, None] - shown[:, None]).max(axis=(-2, -1))
+    assert apart.min() > 0.01, "some cube stands at least 1 cm elsewhere"
+    flat = cubes.reshape(30, -1)
+    between = np.abs(flat[:, None] - flat).max(axis=-1) + np.eye(30)
+    assert between.min() > 0.01, "no two trials share a scene"
+    np.testing.assert_array_equal(scene.qpos, 0)
+
+
+def test_validation_and_test_trials_differ(trained):
+    scenes = [
+        evaluator.trial_scenes(trained.run.env, trained.test.task, run_lib._trial_key(split), 4).mocap_pos
+        for split in ("validation", "test")
+    ]
+    assert np.abs(scenes[0] - scenes[1]).max(axis=(-2, -1)).min() > 0.01
+
+
+@pytest.mark.parametrize(("total", "size"), [(7, 3), (7, 7), (7, 10), (6, 3), (1, 4), (7, 1)])
+def test_map_in_chunks_is_a_plain_call(total, size):
+    rng = np.random.default_rng(0)
+    inputs = ({"a": jnp.asarray(rng.standard_normal((total, 2)))}, jnp.arange(total))
+    shapes = []
+
+    def function(tree, index):
+        shapes.append(index.shape)
+        return {"sum": tree["a"].sum(axis=1) + index}, tree["a"] * index[:, None]
+
+    found = map_in_chunks(function, inputs, size)
+    assert shapes == [(size,)] * -(-total // size), "every call has the same size"
+    jax.tree.map(np.testing.assert_array_equal, found, function(*inputs))
+
+
+def test_map_in_chunks_takes_keys():
+    keys = jax.random.split(jax.random.key(0), 5)
+    draw = jax.vmap(jax.random.uniform)
+    np.testing.assert_array_equal(map_in_chunks(draw, (keys,), 2), draw(keys))
