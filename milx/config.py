@@ -189,11 +189,10 @@ def _reach_fast() -> Config:
 def _reach_cpu() -> Config:
     config = _reach_fast()
     config.env = EnvConfig(image_shape=(32, 40))
-    config.data = DataConfig(tasks=400, demos_per_task=6, plan_iterations=8, plan_batch=100)
-    config.network.filters = (24, 24, 24)
-    config.network.strides = (2, 1, 1)
+    config.data = DataConfig(tasks=300, demos_per_task=5, plan_iterations=8, plan_batch=100)
+    config.network.filters = (32, 32, 32)
     config.network.fc_layers = (100, 100)
-    config.train = TrainConfig(steps=5000, meta_batch=8, support_frames=10, query_frames=10, eval_every=1000)
+    config.train = TrainConfig(steps=8000, meta_batch=16, support_frames=6, query_frames=6, eval_every=1000)
     config.evaluation.validation_tasks = 50
     config.evaluation.batch = 25
     return config

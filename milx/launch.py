@@ -13,6 +13,7 @@ from milx.envs import ENVS
 from milx.methods import METHODS
 
 FLAGS = flags.FLAGS
+flags.disclaim_key_flags()  # so that --help of a launcher lists the flags defined here
 
 
 def define_flags() -> None:
@@ -33,16 +34,10 @@ def run(main: Callable[[Config, str], None]) -> None:
     """Parses the command line and calls `main(config, workdir)`; bad input ends with a message, not a traceback."""
 
     def parse(argv: Sequence[str]) -> list[str]:
-        own = [arg for arg in argv if not arg.startswith(("--config", "-config"))]
-        FLAGS(own)
-        preset = FLAGS.preset or ("cpu" if jax.default_backend() == "cpu" else "fast")
         try:
-            config = config_lib.make_config(FLAGS.env, FLAGS.method, preset, FLAGS.seed)
-        except ValueError as error:
-            raise flags.Error(str(error)) from error
-        _check_fields(argv, config)
-        config_flags.DEFINE_config_dataclass("config", config, "Every hyperparameter.", sys_argv=list(argv))
-        return FLAGS(argv)
+            return _parse(argv)
+        except flags.Error as error:
+            sys.exit(f"milx: {error}")
 
     def start(argv: Sequence[str]) -> None:
         logging.set_verbosity(logging.WARNING)
@@ -59,6 +54,20 @@ def run(main: Callable[[Config, str], None]) -> None:
             sys.exit(f"milx: {error}")
 
     app.run(start, flags_parser=parse)
+
+
+def _parse(argv: Sequence[str]) -> list[str]:
+    """Parses the flags, then the overrides of the configuration that they choose; returns what is left."""
+    own = [arg for arg in argv if not arg.startswith(("--config", "-config"))]
+    FLAGS(own)
+    preset = FLAGS.preset or ("cpu" if jax.default_backend() == "cpu" else "fast")
+    try:
+        config = config_lib.make_config(FLAGS.env, FLAGS.method, preset, FLAGS.seed)
+    except ValueError as error:
+        raise flags.Error(str(error)) from error
+    _check_fields(argv, config)
+    config_flags.DEFINE_config_dataclass("config", config, "Every hyperparameter.", sys_argv=list(argv))
+    return FLAGS(argv)
 
 
 def _check_fields(argv: Sequence[str], config: Config) -> None:

@@ -6,6 +6,7 @@ import pathlib
 import jax
 import jaxlib
 
+_OLD_JAXLIB = tuple(int(part) for part in jaxlib.__version__.split(".")[:2]) < (0, 11)
 # CPU flags for jaxlib before 0.11; unknown flags are fatal, so later versions must not see them.
 # - Fusion emitters fuse MJX's kinematic chain by recomputing it, exponentially in the depth of the chain.
 # - The concurrent scheduler lets two batched LAPACK calls (MJX's Cholesky) wait for each other for ever.
@@ -21,13 +22,20 @@ def cache_folder() -> pathlib.Path:
     return pathlib.Path(home) / "milx"
 
 
+def pixel_options() -> dict[str, bool]:
+    """Compiler options for a program of pixels rather than physics.
+
+    On an old CPU compiler the fusion emitters that `configure` turns off render five times as fast.
+    """
+    return {"xla_cpu_use_fusion_emitters": True} if _OLD_JAXLIB and jax.default_backend() == "cpu" else {}
+
+
 def configure() -> None:
     """Turns the persistent compilation cache on and works around slow MJX code of old CPU compilers.
 
     The cache lives in `cache_folder() / "jax"`; `JAX_COMPILATION_CACHE_DIR` moves it.
     """
-    version = tuple(int(part) for part in jaxlib.__version__.split(".")[:2])
-    if version < (0, 11):
+    if _OLD_JAXLIB:
         given = os.environ.get("XLA_FLAGS", "")
         added = [flag for name, flag in _CPU_FLAGS.items() if name not in given]
         os.environ["XLA_FLAGS"] = " ".join([given, *added]).strip()

@@ -109,16 +109,16 @@ def check_demo(demo: Demo, spec: Spec) -> Demo:
     Raises:
         ValueError: naming the field, what came and what was expected.
     """
-    lead = np.ndim(_require("demo.action", demo.action)) - 2
-    if lead not in (0, 1):
-        raise ValueError(f"demo.action: got shape {np.shape(demo.action)}, expected [T, A] or [K, T, A]")
-    shape = np.shape(demo.action)[: lead + 1]
-    if 0 in shape:
-        raise ValueError(f"demo.action: got shape {np.shape(demo.action)}, expected at least one time step")
+    action = _as_array("demo.action", demo.action)
+    lead = action.ndim - 2
+    if lead not in (0, 1) or 0 in action.shape:
+        expected = "[T, A] or [K, T, A] with at least one time step"
+        raise ValueError(f"demo.action: got shape {list(action.shape)}, expected {expected}")
+    shape = action.shape[: lead + 1]
     checked = Demo(
         image=_check_image("demo.image", demo.image, (*shape, *spec.image_shape, 3)),
         state=_check_vector("demo.state", demo.state, (*shape, spec.state_size)),
-        action=_check_vector("demo.action", demo.action, (*shape, spec.action_size)),
+        action=_check_vector("demo.action", action, (*shape, spec.action_size)),
     )
     return checked if lead else jax.tree.map(lambda x: x[None], checked)
 
@@ -135,10 +135,13 @@ def check_observation(observation: Observation, spec: Spec) -> Observation:
     )
 
 
-def _require(field: str, value: Any) -> Any:
+def _as_array(field: str, value: Any) -> Any:
     if value is None:
         raise ValueError(f"{field}: missing, expected an array")
-    return value
+    try:
+        return value if isinstance(value, jax.Array) else np.asarray(value)
+    except ValueError as error:
+        raise ValueError(f"{field}: got {type(value).__name__}, expected an array ({error})") from error
 
 
 def _check_image(field: str, value: Any, shape: tuple[int, ...]) -> jax.Array | np.ndarray:
@@ -160,8 +163,7 @@ def _check_vector(field: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _check_shape(field: str, value: Any, shape: tuple[int, ...]) -> Any:
-    array = _require(field, value)
-    array = array if isinstance(array, jax.Array) else np.asarray(array)
+    array = _as_array(field, value)
     if array.shape != shape:
         raise ValueError(f"{field}: got shape {list(array.shape)}, expected {list(shape)}")
     return array

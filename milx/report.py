@@ -5,16 +5,13 @@ import pathlib
 from typing import Any
 
 import imageio.v3 as iio
-import matplotlib
 import numpy as np
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
+from matplotlib.figure import Figure
 
 
 def read_metrics(path: pathlib.Path) -> list[dict[str, Any]]:
-    """The lines of a metrics.jsonl file."""
-    return [json.loads(line) for line in path.read_text().splitlines()]
+    """The complete lines of a metrics.jsonl file; a process that was killed may have left half a line at the end."""
+    return [json.loads(line) for line in path.read_text().splitlines(keepends=True) if line.endswith("\n")]
 
 
 def learning_curve(metrics: list[dict[str, Any]], evaluation: dict[str, Any], path: pathlib.Path) -> None:
@@ -25,7 +22,8 @@ def learning_curve(metrics: list[dict[str, Any]], evaluation: dict[str, Any], pa
         evaluation: the run's evaluation.json.
         path: image file to write.
     """
-    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
+    figure = Figure(figsize=(10, 3.6), layout="constrained")
+    left, right = figure.subplots(1, 2)
     losses = [(line["step"], line["loss"]) for line in metrics if "loss" in line]
     left.plot(*zip(*losses, strict=True), color="tab:blue", lw=1)
     left.set(xlabel="meta-updates", ylabel="loss after adaptation", yscale="log")
@@ -41,7 +39,6 @@ def learning_curve(metrics: list[dict[str, Any]], evaluation: dict[str, Any], pa
     right.set(xlabel="meta-updates", ylabel="success", ylim=(0, 1.02))
     right.legend(fontsize=8)
     figure.savefig(path, dpi=120)
-    plt.close(figure)
 
 
 def side_by_side(demo: np.ndarray, trial: np.ndarray, path: pathlib.Path, fps: int = 20) -> None:

@@ -60,13 +60,18 @@ class Run:
         console: where to report progress.
 
     Raises:
-        ValueError: if the folder holds a run of another configuration; the message shows the difference.
+        ValueError: if the folder holds a run of another configuration (the message shows the difference), or the steps
+            are not whole numbers of scans.
     """
 
     def __init__(self, config: Config, workdir: str | pathlib.Path, console: Console | None = None):
         self.config = config
         self.folder = pathlib.Path(workdir)
         self.console = console or Console()
+        for name in ("steps", "eval_every"):
+            value, scan = getattr(config.train, name), config.train.log_every
+            if value < 1 or value % scan:
+                raise ValueError(f"train.{name}: got {value}, expected a positive multiple of train.log_every = {scan}")
         self.env = envs.make(config.env_name, config.env.image_shape)
         self.method = methods.make(config, spec_of(self.env))
         self.trainer = Trainer(
@@ -85,7 +90,7 @@ class Run:
         dataset_hash = demos_lib.fingerprint(train)
         with self._clock("compile"):
             lowered = Trainer.run.lower(self.trainer, state, train, key, config.log_every)
-            run_steps = lowered.compile()
+            run_steps = lowered.compile(platform.pixel_options())
         metrics = MetricsWriter(self.folder, int(state.step))
         with self._progress(config.steps) as progress:
             bar = progress.add_task(

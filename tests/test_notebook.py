@@ -71,7 +71,7 @@ def test_last_output_shows_the_demonstration_beside_another_rollout(executed):
 
 def test_training_and_adaptation_did_something(executed):
     text = printed(executed)
-    (step, loss) = re.search(r"step (\d+), loss ([\d.e+-]+)", text).groups()
+    step, loss = re.search(r"^step (\d+), .*\bloss ([\d.e+-]+)", text, re.MULTILINE).groups()
     assert int(step) == 4
     assert 0 < float(loss) < np.inf
     actions = {

@@ -83,10 +83,9 @@ def frame_indices(key: jax.Array, length: int, count: int | None) -> jax.Array:
     """
     if count is None or count >= length:
         return jnp.arange(length)
-    width = (length - 1) / (count - 1)
-    offset = jax.random.uniform(key, (count - 1,))
-    index = jnp.floor((jnp.arange(count - 1) + offset) * width).astype(jnp.int32)
-    return jnp.append(jnp.minimum(index, length - 2), length - 1)
+    edges = jnp.arange(count) * (length - 1) // (count - 1)
+    offset = jax.random.uniform(key, (count - 1,)) * jnp.diff(edges)
+    return jnp.append(edges[:-1] + offset.astype(jnp.int32), length - 1)
 
 
 def render_demo(env: Env, task: Task, states: State, action: jax.Array, index: jax.Array | None = None) -> Demo:

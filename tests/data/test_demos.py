@@ -137,10 +137,11 @@ def test_frames_come_one_from_each_part_and_the_last_always(length, count):
     assert index.shape == (2000, count)
     assert (np.diff(index, axis=1) > 0).all()
     assert (index[:, -1] == length - 1).all()
+    # Parts are equal up to the rounding of their ends.
     edges = np.arange(count) * (length - 1) / (count - 1)
-    for part in range(count - 1):
-        drawn = np.unique(index[:, part])
-        np.testing.assert_array_equal(drawn, np.arange(int(edges[part]), int(np.ceil(edges[part + 1] - 1e-6))))
+    assert (index[:, :-1] > edges[:-1] - 1).all()
+    assert (index[:, :-1] < edges[1:]).all()
+    np.testing.assert_array_equal(np.unique(index), np.arange(length), "every step is drawn sometimes")
 
 
 @pytest.mark.parametrize("count", [None, 5, 8])
