@@ -22,7 +22,7 @@ def cache_folder() -> pathlib.Path:
     return pathlib.Path(home) / "milx"
 
 
-def pixel_options() -> dict[str, bool]:
+def pixel_options() -> dict[str, str | bool]:
     """Compiler options for a program of pixels rather than physics.
 
     On an old CPU compiler the fusion emitters that `configure` turns off render five times as fast.
