@@ -77,12 +77,12 @@ def test_unknown_method_is_refused_and_the_valid_ones_listed():
 
 def test_differences_name_the_fields():
     old, new = make_config("reach", preset="cpu"), make_config("reach", preset="cpu", seed=2)
-    new.train.meta_batch = 9
-    new.network.filters = (1, 2)
+    old.train.meta_batch, new.train.meta_batch = 8, 9
+    old.network.filters, new.network.filters = (24, 24), (1, 2)
     found = config_lib.differences(config_lib.to_dict(old), config_lib.to_dict(new))
     assert found == [
         "seed was 0, now 2",
-        "network.filters was (24, 24, 24), now (1, 2)",
+        "network.filters was (24, 24), now (1, 2)",
         "train.meta_batch was 8, now 9",
     ]
 
