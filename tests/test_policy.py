@@ -120,7 +120,7 @@ BAD_DEMOS = {
     ),
     "no time steps": (
         lambda d: {"image": d.image[:0], "state": d.state[:0], "action": d.action[:0]},
-        f"demo.action: got shape (0, {A}), expected at least one time step",
+        f"demo.action: got shape [0, {A}], expected [T, A] or [K, T, A] with at least one time step",
     ),
     "a state too few": (
         lambda d: {"state": d.state[1:]},
@@ -131,7 +131,7 @@ BAD_DEMOS = {
         f"demo.image: got shape [{T - 1}, {H}, {W}, 3], expected [{T}, {H}, {W}, 3]",
     ),
     "one set of actions": (lambda d: {"action": d.action[None]}, f"demo.image: got shape [{T}, {H}, {W}, 3]"),
-    "no axis of actions": (lambda d: {"action": d.action[:, 0]}, f"demo.action: got shape ({T},), expected [T, A]"),
+    "no axis of actions": (lambda d: {"action": d.action[:, 0]}, f"demo.action: got shape [{T}], expected [T, A]"),
     "strings": (
         lambda d: {"action": d.action.astype(str)},
         "demo.action: got <U",
