@@ -48,6 +48,7 @@ class NetworkConfig:
         filters: output channels of each convolution.
         strides: stride of each convolution.
         kernel: height and width of every kernel.
+        mixed_precision: convolve in bfloat16; parameters, norms and all other layers stay in float32.
         soft_argmax: spatial soft-argmax after the last convolution, with a learned temperature; flattened otherwise.
         fc_layers: sizes of the hidden fully connected layers.
         fc_norm: layer norm in the hidden fully connected layers.
@@ -60,6 +61,7 @@ class NetworkConfig:
     filters: tuple[int, ...] = (40, 40, 40)
     strides: tuple[int, ...] = (2, 2, 2)
     kernel: int = 3
+    mixed_precision: bool = False
     soft_argmax: bool = False
     fc_layers: tuple[int, ...] = (200, 200, 200, 200)
     fc_norm: bool = True
@@ -142,6 +144,7 @@ class EvalConfig:
         validation_tasks: held-out tasks for choosing the best checkpoint.
         tasks: held-out tasks of the reported number.
         trials: scenes tried for each task.
+        baseline_trials: in how many of those scenes the experts and random actions are tried, too.
         shots: demonstrations that the policy adapts to.
         batch: tasks rolled out at once.
     """
@@ -149,6 +152,7 @@ class EvalConfig:
     validation_tasks: int = 100
     tasks: int = 150
     trials: int = 10
+    baseline_trials: int = 10
     shots: int = 1
     batch: int = 150
 
@@ -179,21 +183,25 @@ def _reach_paper() -> Config:
 
 def _reach_fast() -> Config:
     return Config(
-        network=NetworkConfig(strides=(2, 2, 1), soft_argmax=True, fc_layers=(200, 200), goal_head=True),
+        network=NetworkConfig(
+            strides=(2, 2, 1), soft_argmax=True, fc_layers=(200, 200), goal_head=True, mixed_precision=True
+        ),
         mil=MILConfig(inner_lr=0.03, learn_inner_lr=True, whiten_actions=True, goal_weight=10.0),
         optimizer=OptimizerConfig(warmup=0.05, cosine=True, clip_norm=1.0),
-        train=TrainConfig(steps=24_000, meta_batch=64, support_frames=6, query_frames=6),
+        train=TrainConfig(steps=36_000, meta_batch=32, support_frames=6, query_frames=6),
     )
 
 
 def _reach_cpu() -> Config:
     config = _reach_fast()
     config.env = EnvConfig(image_shape=(32, 40))
-    config.data = DataConfig(tasks=300, demos_per_task=5, plan_iterations=8, plan_batch=100)
-    config.network.filters = (32, 32, 32)
+    config.data = DataConfig(tasks=750, demos_per_task=2, plan_iterations=8, plan_batch=100)
+    config.network.mixed_precision = False
+    config.network.filters = (24, 24, 24)
     config.network.fc_layers = (100, 100)
-    config.train = TrainConfig(steps=8000, meta_batch=16, support_frames=6, query_frames=6, eval_every=1000)
+    config.train = TrainConfig(steps=10_000, meta_batch=16, support_frames=6, query_frames=6, eval_every=1000)
     config.evaluation.validation_tasks = 50
+    config.evaluation.baseline_trials = 2
     config.evaluation.batch = 25
     return config
 

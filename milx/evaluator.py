@@ -5,15 +5,14 @@ One adaptation per task, on a demonstration whose own scene is never a trial sce
 
 import functools
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from milx.chunks import map_in_chunks
 from milx.config import DataConfig, EvalConfig
-from milx.data.demos import DemoSet, render_demo
+from milx.data.demos import DemoSet, render_demo, shapes
 from milx.envs.base import Env, State, Task
 from milx.methods.base import Method
 from milx.methods.random import Random
@@ -38,28 +37,39 @@ def trial_scenes(env: Env, task: Task, key: jax.Array, trials: int) -> State:
     return jax.vmap(jax.vmap(env.reset, in_axes=(0, None)))(keys, task)
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1))
-def _success(
-    env: Env, method: Method, params: Params, task: Task, states: State, action: jax.Array, scene: State, key: jax.Array
-) -> jax.Array:
-    """[N, trials] successes after adapting to demonstrations [N, K, T, ...]."""
+class Trials(NamedTuple):
+    """What became of the trials of N tasks.
 
-    def evaluate_task(task: Task, states: State, action: jax.Array, scene: State, key: jax.Array) -> jax.Array:
+    Attributes:
+        success: [N, trials] bool.
+        states: visited states, with leading axes [N, trials, T + 1].
+    """
+
+    success: jax.Array
+    states: State
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _run_batch(
+    env: Env, method: Method, params: Params, task: Task, states: State, action: jax.Array, scene: State, key: jax.Array
+) -> Trials:
+    """Adapts to demonstrations [N, K, T, ...], then lets the policy act from scenes [N, trials]."""
+
+    def run_task(task: Task, states: State, action: jax.Array, scene: State, key: jax.Array) -> Trials:
         demo = jax.vmap(functools.partial(render_demo, env, task))(states, action)
         task_params = method.adapt(params, demo)
 
-        def trial(scene: State, key: jax.Array) -> jax.Array:
-            return env.success(task, rollout(env, method, task_params, task, scene, key)[0])
+        def trial(scene: State, key: jax.Array) -> Trials:
+            visited, _ = rollout(env, method, task_params, task, scene, key)
+            return Trials(env.success(task, visited), visited)
 
         return jax.vmap(trial)(scene, key)
 
-    return jax.vmap(evaluate_task)(task, states, action, scene, key)
+    return jax.vmap(run_task)(task, states, action, scene, key)
 
 
-def success_table(
-    env: Env, method: Method, params: Params, demos: DemoSet, config: EvalConfig, key: jax.Array
-) -> jax.Array:
-    """Success of every trial of every task in `demos`.
+def run_trials(env: Env, method: Method, params: Params, demos: DemoSet, config: EvalConfig, key: jax.Array) -> Trials:
+    """Runs every trial of every task in `demos`.
 
     Args:
         env: the environment.
@@ -68,16 +78,21 @@ def success_table(
         demos: held-out tasks; the policy adapts to the first `config.shots` demonstrations of each.
         config: trials, shots and batch.
         key: draws the trial scenes.
-
-    Returns:
-        [N, trials] bool.
     """
     scene_key, act_key = jax.random.split(key)
     scene = trial_scenes(env, demos.task, scene_key, config.trials)
     support = jax.tree.map(lambda x: x[:, : config.shots], (demos.states, demos.action))
     keys = jax.random.split(act_key, (demos.num_tasks, config.trials))
     inputs = (demos.task, *support, scene, keys)
-    return map_in_chunks(functools.partial(_success, env, method, params), inputs, config.batch)
+    return map_in_chunks(functools.partial(_run_batch, env, method, params), inputs, config.batch)
+
+
+def precompile(env: Env, method: Method, params: Params, config: EvalConfig) -> None:
+    """Compiles what `run_trials` runs, into the compilation cache; `params` may be shapes."""
+    batch = shapes(env, config.batch, config.shots)
+    keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), (config.batch, config.trials)))
+    scene = jax.eval_shape(lambda task: trial_scenes(env, task, jax.random.key(0), config.trials), batch.task)
+    _run_batch.lower(env, method, params, batch.task, batch.states, batch.action, scene, keys).compile()
 
 
 def baselines(env: Env, demos: DemoSet, config: EvalConfig, expert: DataConfig, key: jax.Array) -> dict[str, float]:
@@ -85,57 +100,34 @@ def baselines(env: Env, demos: DemoSet, config: EvalConfig, expert: DataConfig, 
 
     The task-blind expert goes to a random candidate; the expert runs its plan without noise.
     """
-    options = Options(iterations=expert.plan_iterations)
+    num_trials = config.baseline_trials
     scene = trial_scenes(env, demos.task, jax.random.split(key)[0], config.trials)
-    task = jax.tree.map(lambda x: jnp.repeat(x, config.trials, axis=0), demos.task)
-    scene = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), scene)
-    keys = jax.random.split(jax.random.fold_in(key, 1), len(jax.tree.leaves(scene)[0]))
+    scene = jax.tree.map(lambda x: x[:, :num_trials].reshape(-1, *x.shape[2:]), scene)
+    task = jax.tree.map(lambda x: jnp.repeat(x, num_trials, axis=0), demos.task)
+    keys = jax.random.split(jax.random.fold_in(key, 1), demos.num_tasks * num_trials)
 
-    def expert_success(believed: Task) -> float:
-        """Success at `task` of an expert who takes the task for `believed`."""
-        states, _ = map_in_chunks(
-            lambda *chunk: perform(env, *chunk, options, 0.0), (believed, scene, keys), expert.plan_batch
-        )
-        return float(jax.jit(jax.vmap(env.success))(task, states).mean())
-
-    random = success_table(env, Random(env.action_size), (), demos, config, key)
-    return {
-        "random": float(random.mean()),
-        "task_blind": expert_success(jax.vmap(env.task_blind)(keys, task)),
-        "expert": expert_success(task),
-    }
+    # Both experts plan for the task as they believe it to be, and both are judged by the task as it is.
+    believed = jax.vmap(env.task_blind)(keys, task), task
+    twice = [jax.tree.map(lambda *xs: jnp.concatenate(xs), *pair) for pair in (believed, (scene, scene), (keys, keys))]
+    options = Options(iterations=expert.plan_iterations)
+    states, _ = map_in_chunks(lambda *chunk: perform(env, *chunk, options, 0.0), tuple(twice), expert.plan_batch)
+    both = jax.tree.map(lambda x: x.reshape(2, -1, *x.shape[1:]), states)
+    task_blind, informed = jax.jit(jax.vmap(jax.vmap(env.success), in_axes=(None, 0)))(task, both).mean(axis=1)
+    random = run_trials(env, Random(env.action_size), (), demos, config, key).success[:, :num_trials]
+    return {"random": float(random.mean()), "task_blind": float(task_blind), "expert": float(informed)}
 
 
-def film(
-    env: Env, camera: Env, method: Method, params: Params, demos: DemoSet, key: jax.Array
-) -> tuple[np.ndarray, np.ndarray]:
-    """Films one demonstration of each task, and one trial after adapting to it.
+@functools.partial(jax.jit, static_argnums=0)
+def film(camera: Env, task: Task, states: State) -> jax.Array:
+    """Images [N, T + 1, H, W, 3] uint8 of episodes of N tasks: `states` has leading axes [N, T + 1].
 
-    Args:
-        env: what the policy sees and acts in.
-        camera: the same environment with larger images.
-        method: what adapts and acts.
-        params: what it has learnt.
-        demos: N tasks.
-        key: draws the trial scenes.
-
-    Returns:
-        Images [N, T, H, W, 3] uint8 of the demonstrations and of the trials.
+    `camera` is the environment with the wanted image size.
     """
-
-    def film_task(task: Task, states: State, action: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        demo = jax.tree.map(lambda x: x[None], render_demo(env, task, states, action))
-        visited, _ = rollout(env, method, method.adapt(params, demo), task, env.reset(key, task), key)
-        shots = [render_demo(camera, task, path, action).image for path in (states, visited)]
-        return shots[0], shots[1]
-
-    keys = jax.random.split(key, demos.num_tasks)
-    first = jax.tree.map(lambda x: x[:, 0], (demos.states, demos.action))
-    demo, trial = jax.jit(jax.vmap(film_task))(demos.task, *first, keys)
-    return np.asarray(demo), np.asarray(trial)
+    observe = jax.vmap(jax.vmap(camera.observe, in_axes=(None, 0)))
+    return observe(task, states).image
 
 
-def summary(table: jax.Array) -> dict[str, Any]:
+def summary(success: jax.Array) -> dict[str, Any]:
     """Trials, success rate and its interval from [N, trials] successes."""
-    successes, trials = int(table.sum()), int(table.size)
+    successes, trials = int(success.sum()), int(success.size)
     return {"trials": trials, "success": successes / trials, "wilson95": list(wilson_interval(successes, trials))}

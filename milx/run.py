@@ -12,10 +12,12 @@ import contextlib
 import json
 import pathlib
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 import jax
+import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from tensorboardX import SummaryWriter
@@ -26,6 +28,8 @@ from milx.checkpoint import Checkpoints
 from milx.config import Config
 from milx.data import demos as demos_lib
 from milx.data.demos import DemoSet
+from milx.envs.base import State
+from milx.methods.random import Random
 from milx.policy import params_like, spec_of
 from milx.trainer import Trainer, TrainState, make_optimizer
 from milx.types import Params
@@ -84,13 +88,15 @@ class Run:
     def train(self) -> None:
         """Meta-trains to the configured number of steps, from the latest checkpoint if there is one."""
         config = self.config.train
-        train, validation = self.demos("train"), self.demos("validation")
         checkpoints = Checkpoints(self.folder / "checkpoints")
+        if (checkpoints.latest or 0) >= config.steps:
+            return checkpoints.close()
+        compiled = self._compile_in_background()
+        train, validation = self.demos("train"), self.demos("validation")
         state, key = self._start(train, checkpoints)
         dataset_hash = demos_lib.fingerprint(train)
         with self._clock("compile"):
-            lowered = Trainer.run.lower(self.trainer, state, train, key, config.log_every)
-            run_steps = lowered.compile(platform.pixel_options())
+            run_steps = compiled.result()
         metrics = MetricsWriter(self.folder, int(state.step))
         with self._progress(config.steps) as progress:
             bar = progress.add_task(
@@ -124,20 +130,20 @@ class Run:
         step = checkpoints.best
         if step is None or checkpoints.latest is None:
             raise ValueError(f"workdir: {self.folder} has no checkpoint yet; train first")
-        items, _ = checkpoints.restore(step, {"params": params_like(self.method, spec_of(self.env))})
+        items, _ = checkpoints.restore(step, {"params": self._params_like})
         _, extra = checkpoints.restore(checkpoints.latest, {})
         self.seconds = extra["seconds"]
         config, test = self.config.evaluation, self.demos("test")
         key = _trial_key("test")
         with self._clock("evaluate"):
-            table = evaluator.success_table(self.env, self.method, items["params"], test, config, key)
+            trials = evaluator.run_trials(self.env, self.method, items["params"], test, config, key)
             floors = evaluator.baselines(self.env, test, config, self.config.data, key)
-        result = self._result(evaluator.summary(table), floors, step, extra["dataset_hash"])
+        result = self._result(evaluator.summary(trials.success), floors, step, extra["dataset_hash"])
         (self.folder / "evaluation.json").write_text(json.dumps(result, indent=1) + "\n")
         report.learning_curve(
             report.read_metrics(self.folder / "metrics.jsonl"), result, self.folder / "learning_curve.png"
         )
-        self._film(items["params"], test, key)
+        self._film(test, trials.states)
         return result
 
     def report(self, result: dict[str, Any]) -> None:
@@ -158,12 +164,35 @@ class Run:
         self.console.print(f"{count} {split} demonstrations, of which {success:.1%} succeed")
         return demos
 
+    @property
+    def _params_like(self) -> Params:
+        return params_like(self.method, spec_of(self.env))
+
+    def _compile_in_background(self) -> Future[Callable[..., Any]]:
+        """Compiles the scan of meta-updates and the evaluation from shapes alone, while demonstrations are planned."""
+        config, params = self.config, self._params_like
+        state = TrainState(
+            jax.ShapeDtypeStruct((), np.int32), params, jax.eval_shape(self.trainer.optimizer.init, params)
+        )
+        demos = demos_lib.shapes(self.env, config.data.tasks, config.data.demos_per_task)
+
+        def compile_step() -> Callable[..., Any]:
+            lowered = Trainer.run.lower(self.trainer, state, demos, jax.random.key(0), config.train.log_every)
+            return lowered.compile(platform.pixel_options())
+
+        threads = ThreadPoolExecutor()
+        compiled = threads.submit(compile_step)
+        for method, like in ((self.method, params), (Random(self.env.action_size), ())):
+            threads.submit(evaluator.precompile, self.env, method, like, config.evaluation)
+        threads.shutdown(wait=False)
+        return compiled
+
     def _start(self, train: DemoSet, checkpoints: Checkpoints) -> tuple[TrainState, jax.Array]:
         """The state to train from, and the key of the batches."""
         init_key, batch_key = jax.random.split(jax.random.fold_in(jax.random.key(self.config.seed), 3))
         seen = jax.jit(jax.vmap(jax.vmap(jax.vmap(self.env.robot_state))))(train.states)
         statistics = whitening.fit(seen, train.action, self.config.mil.whiten_actions)
-        state = self.trainer.init(init_key, statistics)
+        state = jax.jit(self.trainer.init)(init_key, statistics)
         if checkpoints.latest is not None:
             like = {"params": state.params, "trainer": (state.step, state.optimizer)}
             items, extra = checkpoints.restore(checkpoints.latest, like)
@@ -176,17 +205,17 @@ class Run:
     def _validate(self, params: Params, validation: DemoSet) -> float:
         key = _trial_key("validation")
         with self._clock("evaluate"):
-            table = evaluator.success_table(self.env, self.method, params, validation, self.config.evaluation, key)
-            return float(table.mean())
+            trials = evaluator.run_trials(self.env, self.method, params, validation, self.config.evaluation, key)
+            return float(trials.success.mean())
 
-    def _film(self, params: Params, test: DemoSet, key: jax.Array, num_tasks: int = 3) -> None:
-        """Writes the video: demonstrations beside the policy's rollouts on the same held-out tasks, in large."""
+    def _film(self, test: DemoSet, visited: State, num_tasks: int = 3) -> None:
+        """Writes the video: demonstrations beside the first trial of the same held-out tasks, in large."""
         height, width = self.env.image_shape
         scale = max(1, 256 // height)
         camera = envs.make(self.config.env_name, (scale * height, scale * width))
-        few = jax.tree.map(lambda x: x[:num_tasks], test)
-        demo, trial = evaluator.film(self.env, camera, self.method, params, few, key)
-        report.side_by_side(demo, trial, self.folder / "rollouts.gif")
+        task, demo, trial = jax.tree.map(lambda x: x[:num_tasks], (test.task, test.states, visited))
+        clips = [evaluator.film(camera, task, jax.tree.map(lambda x: x[:, 0], states)) for states in (demo, trial)]
+        report.side_by_side(np.asarray(clips[0]), np.asarray(clips[1]), self.folder / "rollouts.gif")
 
     def _result(
         self, summary: dict[str, Any], floors: dict[str, float], step: int, dataset_hash: str

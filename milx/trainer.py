@@ -16,7 +16,7 @@ from milx.config import OptimizerConfig, TrainConfig
 from milx.data.demos import DemoSet, sample_batch
 from milx.envs.base import Env
 from milx.methods.base import Method
-from milx.types import Params
+from milx.types import Array, Params
 from milx.whitening import Whitening
 
 
@@ -31,7 +31,7 @@ class TrainState:
         optimizer: the optimizer's own state.
     """
 
-    step: jax.Array
+    step: Array
     params: Params
     optimizer: Any
 

@@ -68,8 +68,8 @@ def test_table_is_the_same_for_batches_of_two_and_three(trained):
     env, method = trained.run.env, Replay()
     key = jax.random.key(5)
     config = EvalConfig(trials=24, shots=1, batch=3)
-    three = evaluator.success_table(env, method, (), trained.test, config, key)
-    two = evaluator.success_table(env, method, (), trained.test, dataclasses.replace(config, batch=2), key)
+    three = evaluator.run_trials(env, method, (), trained.test, config, key).success
+    two = evaluator.run_trials(env, method, (), trained.test, dataclasses.replace(config, batch=2), key).success
     assert three.shape == (3, 24)
     assert 0 < three.mean() < 1, "replay succeeds by luck in some scenes"
     np.testing.assert_array_equal(two, three)
@@ -80,11 +80,11 @@ def test_no_trial_takes_place_in_the_demonstration_s_scene(trained, split, monke
     demos = getattr(trained, split)
     # What a trial is given: its scene, and the demonstration that the policy adapts to.
     monkeypatch.setattr(
-        evaluator, "_success", lambda env, method, params, task, states, action, scene, key: (scene, states, action)
+        evaluator, "_run_batch", lambda env, method, params, task, states, action, scene, key: (scene, states, action)
     )
     config = dataclasses.replace(trained.config.evaluation, trials=10)
     key = run_lib._trial_key(split)
-    scene, states, action = evaluator.success_table(trained.run.env, trained.run.method, (), demos, config, key)
+    scene, states, action = evaluator.run_trials(trained.run.env, trained.run.method, (), demos, config, key)
     np.testing.assert_array_equal(action, demos.action[:, :1])
     cubes, shown = np.asarray(scene.mocap_pos), np.asarray(states.mocap_pos[:, :, 0])
     assert cubes.shape == (3, 10, 3, 3)

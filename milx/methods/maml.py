@@ -10,6 +10,9 @@ through the inner step, `vmap` over the tasks.
 """
 
 import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +22,30 @@ from milx.methods.base import Method
 from milx.networks.policy import PolicyNetwork
 from milx.types import Demo, Memory, Observation, Params, TaskBatch
 from milx.whitening import Whitening
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
+def gradient(loss: Callable[..., jax.Array], theta: Params, *data: Any) -> Params:
+    """The gradient of loss(theta, *data), differentiable in theta; `data` counts as constant.
+
+    Its derivative is a product of the Hessian with a vector. As the Hessian is symmetric, the product may be taken
+    forward over reverse, which keeps no intermediate results of the inner gradient for the meta-gradient (Pearlmutter
+    1994), where reverse over reverse keeps them all.
+    """
+    return jax.grad(loss)(theta, *data)
+
+
+def _gradient_forward(loss: Callable[..., jax.Array], theta: Params, *data: Any) -> tuple[Params, tuple]:
+    return jax.grad(loss)(theta, *data), (theta, *data)
+
+
+def _gradient_backward(loss: Callable[..., jax.Array], inputs: tuple, vector: Params) -> tuple:
+    theta, *data = inputs
+    _, product = jax.jvp(lambda theta: jax.grad(loss)(theta, *data), (theta,), (vector,))
+    return product, *(None for _ in data)
+
+
+gradient.defvjp(_gradient_forward, _gradient_backward)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -54,7 +81,7 @@ class MIL(Method):
             rates = jax.tree.map(lambda s: self.config.inner_lr * jnp.exp(s), params["inner_log_lr"])
         clip = self.config.inner_clip
         for _ in range(self.config.inner_steps):
-            grad, _ = jax.grad(self.imitation_loss, has_aux=True)(theta, params["whitening"], demo, inner=True)
+            grad = gradient(self._inner_loss, theta, params["whitening"], demo)
             if self.config.first_order:
                 grad = jax.lax.stop_gradient(grad)
             theta = jax.tree.map(lambda p, g, rate: p - rate * jnp.clip(g, -clip, clip), theta, grad, rates)
@@ -76,6 +103,9 @@ class MIL(Method):
         state = whitening.state(observation.state)
         output = self.network.apply(task_params["policy"], observation.image[None], state[None])
         return whitening.unwhiten_action(output.action[0]), memory
+
+    def _inner_loss(self, theta: Params, whitening: Whitening, demo: Demo) -> jax.Array:
+        return self.imitation_loss(theta, whitening, demo, inner=True)[0]
 
     def imitation_loss(
         self, theta: Params, whitening: Whitening, demo: Demo, inner: bool = False

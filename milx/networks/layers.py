@@ -85,19 +85,24 @@ class ConvBlock(nn.Module):
         filters: F, output channels.
         kernel: kernel height and width.
         stride: the same in both directions.
+        mixed_precision: convolve, and hand on, in bfloat16; the norm is computed in the parameters' type.
     """
 
     filters: int
     kernel: int
     stride: int
+    mixed_precision: bool = False
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
         """Maps [B, H, W, C] to [B, ceil(H / stride), ceil(W / stride), F]."""
         shape = (self.kernel, self.kernel, x.shape[-1], self.filters)
-        x = conv2d(x, self.param("kernel", nn.initializers.lecun_normal(), shape), self.stride)
-        x = x + self.param("bias", nn.initializers.zeros, (self.filters,))
-        return nn.relu(centred_layer_norm(x, self.param("centre", nn.initializers.zeros, (self.filters,))))
+        kernel = self.param("kernel", nn.initializers.lecun_normal(), shape)
+        bias = self.param("bias", nn.initializers.zeros, (self.filters,))
+        centre = self.param("centre", nn.initializers.zeros, (self.filters,))
+        dtype = jnp.bfloat16 if self.mixed_precision else kernel.dtype
+        x = conv2d(x.astype(dtype), kernel.astype(dtype), self.stride)
+        return nn.relu(centred_layer_norm(x.astype(bias.dtype) + bias, centre)).astype(dtype)
 
 
 class Dense(nn.Module):

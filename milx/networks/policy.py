@@ -46,9 +46,10 @@ class _Policy(nn.Module):
     @nn.compact
     def __call__(self, image: jax.Array, state: jax.Array) -> PolicyOutput:
         config = self.config
-        x = image.astype(jnp.float32) / 255.0
+        x = image.astype(state.dtype) / 255.0
         for filters, stride in zip(config.filters, config.strides, strict=True):
-            x = ConvBlock(filters, config.kernel, stride)(x)
+            x = ConvBlock(filters, config.kernel, stride, config.mixed_precision)(x)
+        x = x.astype(state.dtype)
         if config.soft_argmax:
             x = spatial_soft_argmax(x, jnp.exp(self.param("log_temperature", nn.initializers.zeros, x.shape[-1:])))
         else:
