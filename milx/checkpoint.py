@@ -3,6 +3,9 @@
 import pathlib
 from typing import Any
 
+import jax
+import jax.numpy as jnp
+import numpy as np
 import orbax.checkpoint as ocp
 from orbax.checkpoint import checkpoint_managers as policies
 
@@ -62,7 +65,9 @@ class Checkpoints:
         """
         restores = {name: ocp.args.StandardRestore(tree) for name, tree in like.items()}
         restored = self._manager.restore(step, args=ocp.args.Composite(**restores, extra=ocp.args.JsonRestore()))
-        return {name: restored[name] for name in like}, restored["extra"]
+        # Orbax pins arrays to the device that they come to, and a program compiled for free ones would compile again.
+        items = {name: jax.tree.map(lambda x: jnp.asarray(np.asarray(x)), restored[name]) for name in like}
+        return items, restored["extra"]
 
     def close(self) -> None:
         """Waits until everything is written."""

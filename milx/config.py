@@ -195,13 +195,13 @@ def _reach_fast() -> Config:
 def _reach_cpu() -> Config:
     config = _reach_fast()
     config.env = EnvConfig(image_shape=(32, 40))
-    config.data = DataConfig(tasks=750, demos_per_task=2, plan_iterations=8, plan_batch=100)
+    config.data = DataConfig(tasks=300, demos_per_task=5, plan_iterations=8, plan_batch=100)
     config.network.mixed_precision = False
-    config.network.filters = (24, 24, 24)
+    config.network.filters = (32, 32, 32)
     config.network.fc_layers = (100, 100)
-    config.train = TrainConfig(steps=10_000, meta_batch=16, support_frames=6, query_frames=6, eval_every=1000)
+    config.train = TrainConfig(steps=8000, meta_batch=16, support_frames=6, query_frames=6, eval_every=2000)
     config.evaluation.validation_tasks = 50
-    config.evaluation.baseline_trials = 2
+    config.evaluation.baseline_trials = 1
     config.evaluation.batch = 25
     return config
 

@@ -180,11 +180,11 @@ class Run:
             lowered = Trainer.run.lower(self.trainer, state, demos, jax.random.key(0), config.train.log_every)
             return lowered.compile(platform.pixel_options())
 
-        threads = ThreadPoolExecutor()
-        compiled = threads.submit(compile_step)
+        thread = ThreadPoolExecutor(max_workers=1)  # tracing holds Python's lock: more would slow the planner's down
+        compiled = thread.submit(compile_step)
         for method, like in ((self.method, params), (Random(self.env.action_size), ())):
-            threads.submit(evaluator.precompile, self.env, method, like, config.evaluation)
-        threads.shutdown(wait=False)
+            thread.submit(evaluator.precompile, self.env, method, like, config.evaluation)
+        thread.shutdown(wait=False)
         return compiled
 
     def _start(self, train: DemoSet, checkpoints: Checkpoints) -> tuple[TrainState, jax.Array]:

@@ -6,6 +6,7 @@ task starts in another *scene* (positions), which lives in the state. Both are p
 
 import abc
 import dataclasses
+import functools
 import pathlib
 from typing import Any
 
@@ -140,6 +141,7 @@ class Env(abc.ABC):
         """MJX data holding this state; derived quantities are not computed yet."""
         return self._data.replace(qpos=state.qpos, qvel=state.qvel, mocap_pos=state.mocap_pos)
 
+    @functools.partial(jax.jit, static_argnums=0)  # so that MJX, slow to trace, is traced once for all callers
     def step(self, task: Task, state: State, action: jax.Array) -> State:
         """Applies `action` [A], clipped to `action_range`, for `substeps` physics steps."""
         ctrl = jnp.clip(action, *self.action_range)
@@ -155,6 +157,7 @@ class Env(abc.ABC):
         data = mjx.step(self.model, self.data(state).replace(ctrl=ctrl))
         return jnp.concatenate([data.qpos, data.qvel])
 
+    @functools.partial(jax.jit, static_argnums=0)
     def observe(self, task: Task, state: State) -> Observation:
         """Renders the task's scene: image [H, W, 3] uint8 and robot state [S]."""
         data = mjx.kinematics(self.model, self.data(state))

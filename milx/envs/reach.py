@@ -1,6 +1,7 @@
 """Vision reach: a planar two-joint arm goes to the cube of the demonstrated colour (paper, Section 6.1)."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -69,7 +70,7 @@ class Reach(Env):
         check_split(split)
         color_key, target_key = jax.random.split(key)
         index = jax.random.choice(color_key, 1000, (NUM_OBJECTS,), replace=False)
-        grid = jnp.stack([index // 100, index // 10 % 10, index % 10], axis=-1)
+        grid = jnp.stack([index // 100, index // 10 % 10, index % 10], axis=-1).astype(jnp.float32)
         target = jax.random.randint(target_key, (), 0, NUM_OBJECTS)
         return ReachTask(object_color=grid * 0.1 + COLOR_OFFSETS[split], target=target)
 
@@ -82,6 +83,7 @@ class Reach(Env):
         height = jnp.full((NUM_OBJECTS, 1), self._height)
         return State(jnp.zeros(2), jnp.zeros(2), jnp.concatenate([position, height], axis=-1))
 
+    @functools.partial(jax.jit, static_argnums=0)
     def fingertip(self, qpos: jax.Array) -> jax.Array:
         """[2] position of the fingertip in the plane (m) for joint angles [2]."""
         data = mjx.kinematics(self.model, self._data.replace(qpos=qpos))
