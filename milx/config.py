@@ -199,8 +199,8 @@ def _reach_cpu() -> Config:
     config.network.mixed_precision = False
     config.network.filters = (32, 32, 32)
     config.network.fc_layers = (100, 100)
-    config.train = TrainConfig(steps=8000, meta_batch=16, support_frames=6, query_frames=6, eval_every=2000)
-    config.evaluation.validation_tasks = 50
+    config.train = TrainConfig(steps=14_000, meta_batch=8, support_frames=6, query_frames=6, eval_every=2000)
+    config.evaluation.validation_tasks = 25
     config.evaluation.baseline_trials = 1
     config.evaluation.batch = 25
     return config
