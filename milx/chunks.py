@@ -6,6 +6,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from milx import parallel
+
 
 def map_in_chunks(function: Callable[..., Any], inputs: tuple, size: int) -> Any:
     """Calls `function(*inputs)` on slices of the leading axis and joins the results.
@@ -15,12 +17,12 @@ def map_in_chunks(function: Callable[..., Any], inputs: tuple, size: int) -> Any
     Args:
         function: maps pytrees with leading axis [size] to a pytree with leading axis [size].
         inputs: pytrees with leading axis [M].
-        size: the most entries of one call.
+        size: the most entries of one call, but for rounding up to a multiple of the number of devices.
 
     Returns:
         The results, with leading axis [M].
     """
-    total = len(jax.tree.leaves(inputs)[0])
+    total, size = len(jax.tree.leaves(inputs)[0]), parallel.round_up(size)
     results = []
     for start in range(0, total, size):
         index = jnp.minimum(jnp.arange(start, start + size), total - 1)

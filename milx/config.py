@@ -5,6 +5,7 @@ overrides one field of it.
 """
 
 import dataclasses
+import functools
 import typing
 from collections.abc import Callable
 from typing import Any
@@ -123,6 +124,8 @@ class TrainConfig:
         shots: support demonstrations of each task.
         support_frames: time steps drawn from each support demonstration; None for all.
         query_frames: time steps drawn from each query demonstration; None for all.
+        redraw_appearance: show a task in new colours of the training split whenever it is drawn, so that few planned
+            demonstrations stand for many tasks.
         log_every: meta-updates in one scan on the device.
         eval_every: meta-updates between two validations; each is followed by a checkpoint.
     """
@@ -132,6 +135,7 @@ class TrainConfig:
     shots: int = 1
     support_frames: int | None = None
     query_frames: int | None = None
+    redraw_appearance: bool = False
     log_every: int = 100
     eval_every: int = 2000
 
@@ -199,7 +203,9 @@ def _reach_cpu() -> Config:
     config.network.mixed_precision = False
     config.network.filters = (32, 32, 32)
     config.network.fc_layers = (100, 100)
-    config.train = TrainConfig(steps=14_000, meta_batch=8, support_frames=6, query_frames=6, eval_every=2000)
+    config.train = TrainConfig(
+        steps=20_000, meta_batch=16, support_frames=3, query_frames=3, redraw_appearance=True, eval_every=4000
+    )
     config.evaluation.validation_tasks = 25
     config.evaluation.baseline_trials = 1
     config.evaluation.batch = 25
@@ -253,6 +259,25 @@ def differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
     """Where two configurations of `to_dict` differ, a line each."""
     before, after = flatten(old), flatten(new)
     return [f"{name} was {before[name]}, now {after[name]}" for name in before if before[name] != after[name]]
+
+
+def unset(config: Config, field: str) -> None:
+    """Sets the field with this dotted name to None.
+
+    Raises:
+        ValueError: if it cannot be None.
+    """
+    *path, name = field.split(".")
+    holder: Any = functools.reduce(getattr, path, config)
+    if type(None) not in typing.get_args(typing.get_type_hints(type(holder))[name]):
+        raise ValueError(f"config.{field}: got None, expected a value")
+    setattr(holder, name, None)
+
+
+def overrides(config: Config) -> dict[str, Any]:
+    """The fields, by dotted name, in which a configuration differs from its preset."""
+    preset = flatten(to_dict(make_config(config.env_name, config.method_name, config.preset, config.seed)))
+    return {name: value for name, value in flatten(to_dict(config)).items() if value != preset[name]}
 
 
 def _build(cls: type, values: dict[str, Any], path: str) -> Any:

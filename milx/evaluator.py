@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from milx import parallel
 from milx.chunks import map_in_chunks
 from milx.config import DataConfig, EvalConfig
 from milx.data.demos import DemoSet, render_demo, shapes
@@ -27,7 +28,8 @@ def wilson_interval(successes: int, trials: int, z: float = 1.959964) -> tuple[f
     rate, spread = successes / trials, z * z / trials
     centre = (rate + spread / 2) / (1 + spread)
     half = math.sqrt(rate * (1 - rate) * spread + spread * spread / 4) / (1 + spread)
-    return max(centre - half, 0.0), min(centre + half, 1.0)
+    # Rounding must not put the rate itself outside.
+    return max(min(centre - half, rate), 0.0), min(max(centre + half, rate), 1.0)
 
 
 def trial_scenes(env: Env, task: Task, key: jax.Array, trials: int) -> State:
@@ -55,7 +57,7 @@ def _run_batch(
 ) -> Trials:
     """Adapts to demonstrations [N, K, T, ...], then lets the policy act from scenes [N, trials]."""
 
-    def run_task(task: Task, states: State, action: jax.Array, scene: State, key: jax.Array) -> Trials:
+    def run_task(params: Params, task: Task, states: State, action: jax.Array, scene: State, key: jax.Array) -> Trials:
         demo = jax.vmap(functools.partial(render_demo, env, task))(states, action)
         task_params = method.adapt(params, demo)
 
@@ -65,7 +67,8 @@ def _run_batch(
 
         return jax.vmap(trial)(scene, key)
 
-    return jax.vmap(run_task)(task, states, action, scene, key)
+    run_tasks = jax.vmap(run_task, in_axes=(None, 0, 0, 0, 0, 0))
+    return parallel.split_tasks(run_tasks, shared=1)(params, task, states, action, scene, key)
 
 
 def run_trials(env: Env, method: Method, params: Params, demos: DemoSet, config: EvalConfig, key: jax.Array) -> Trials:
@@ -89,18 +92,20 @@ def run_trials(env: Env, method: Method, params: Params, demos: DemoSet, config:
 
 def precompile(env: Env, method: Method, params: Params, config: EvalConfig) -> None:
     """Compiles what `run_trials` runs, into the compilation cache; `params` may be shapes."""
-    batch = shapes(env, config.batch, config.shots)
-    keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), (config.batch, config.trials)))
+    size = parallel.round_up(config.batch)
+    batch = shapes(env, size, config.shots)
+    keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), (size, config.trials)))
     scene = jax.eval_shape(lambda task: trial_scenes(env, task, jax.random.key(0), config.trials), batch.task)
     _run_batch.lower(env, method, params, batch.task, batch.states, batch.action, scene, keys).compile()
 
 
 def baselines(env: Env, demos: DemoSet, config: EvalConfig, expert: DataConfig, key: jax.Array) -> dict[str, float]:
-    """Success rates in the same trials of: random actions, the task-blind expert, and the expert.
+    """Success rates of random actions, the task-blind expert, and the expert.
 
-    The task-blind expert goes to a random candidate; the expert runs its plan without noise.
+    They run in the first `config.baseline_trials` of every task's trials. The task-blind expert goes to a random
+    candidate; the expert runs its plan without noise.
     """
-    num_trials = config.baseline_trials
+    num_trials = min(config.baseline_trials, config.trials)
     scene = trial_scenes(env, demos.task, jax.random.split(key)[0], config.trials)
     scene = jax.tree.map(lambda x: x[:, :num_trials].reshape(-1, *x.shape[2:]), scene)
     task = jax.tree.map(lambda x: jnp.repeat(x, num_trials, axis=0), demos.task)

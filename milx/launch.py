@@ -8,16 +8,18 @@ from absl import app, flags, logging
 from ml_collections import config_flags
 
 from milx import config as config_lib
+from milx import parallel
 from milx.config import PRESETS, Config
 from milx.envs import ENVS
 from milx.methods import METHODS
 
 FLAGS = flags.FLAGS
+_OWN_FLAGS = {"env_name": "env", "method_name": "method", "preset": "preset", "seed": "seed"}
 flags.disclaim_key_flags()  # so that --help of a launcher lists the flags defined here
 
 
 def define_flags() -> None:
-    """Defines --env, --method, --preset, --seed and --workdir."""
+    """Defines --env, --method, --preset, --seed, --workdir and what several hosts need."""
     flags.DEFINE_string("env", "reach", f"Environment: {', '.join(ENVS)}.")
     flags.DEFINE_string("method", "mil", f"Method: {', '.join(METHODS)}.")
     flags.DEFINE_string(
@@ -27,6 +29,11 @@ def define_flags() -> None:
         "and networks; the default without an accelerator). --config.path.to.field=value changes any of them.",
     )
     flags.DEFINE_integer("seed", 0, "Seed of training tasks, initial parameters and batches.", lower_bound=0)
+    flags.DEFINE_string(
+        "coordinator", None, "Several hosts outside SLURM and Cloud TPU: address:port of the first one."
+    )
+    flags.DEFINE_integer("num_processes", None, "With --coordinator: how many hosts there are.", lower_bound=1)
+    flags.DEFINE_integer("process_id", None, "With --coordinator: this host's number, from 0.", lower_bound=0)
     flags.DEFINE_string("workdir", None, "Folder of the run; default runs/<env>-<method>-<preset>-<seed>.")
 
 
@@ -60,14 +67,22 @@ def _parse(argv: Sequence[str]) -> list[str]:
     """Parses the flags, then the overrides of the configuration that they choose; returns what is left."""
     own = [arg for arg in argv if not arg.startswith(("--config", "-config"))]
     FLAGS(own)
+    parallel.join_hosts(FLAGS.coordinator, FLAGS.num_processes, FLAGS.process_id)
     preset = FLAGS.preset or ("cpu" if jax.default_backend() == "cpu" else "fast")
     try:
         config = config_lib.make_config(FLAGS.env, FLAGS.method, preset, FLAGS.seed)
     except ValueError as error:
         raise flags.Error(str(error)) from error
     _check_fields(argv, config)
-    config_flags.DEFINE_config_dataclass("config", config, "Every hyperparameter.", sys_argv=list(argv))
-    return FLAGS(argv)
+    unset = [arg for arg in argv if arg.startswith("--config.") and arg.endswith("=None")]
+    for arg in unset:  # ml_collections has no way to say None
+        try:
+            config_lib.unset(config, arg.removeprefix("--config.").removesuffix("=None"))
+        except ValueError as error:
+            raise flags.Error(str(error)) from error
+    rest = [arg for arg in argv if arg not in unset]
+    config_flags.DEFINE_config_dataclass("config", config, "Every hyperparameter.", sys_argv=rest)
+    return FLAGS(rest)
 
 
 def _check_fields(argv: Sequence[str], config: Config) -> None:
@@ -75,5 +90,7 @@ def _check_fields(argv: Sequence[str], config: Config) -> None:
     known = config_lib.flatten(config_lib.to_dict(config))
     for arg in argv[1:]:
         name = arg.lstrip("-").split("=")[0]
+        if name.startswith("config.") and (field := name.removeprefix("config.")) in _OWN_FLAGS:
+            raise flags.Error(f"--{name}: expected --{_OWN_FLAGS[field]}, which also chooses the defaults")
         if name.startswith("config.") and name.removeprefix("config.") not in known:
             raise flags.Error(f"--{name}: no such field, expected one of\n  " + "\n  ".join(known))

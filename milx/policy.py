@@ -19,7 +19,8 @@ from milx.whitening import Whitening
 
 def spec_of(env: envs.Env) -> Spec:
     """The sizes of what a policy sees and does in an environment."""
-    return Spec(env.image_shape, env.state_size, env.action_size, env.goal_indices)
+    low, high = (tuple(np.asarray(limit).tolist()) for limit in env.action_range)
+    return Spec(env.image_shape, env.state_size, env.action_size, (low, high), env.goal_indices)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -53,7 +54,8 @@ class Policy:
             task_params for `act`.
 
         Raises:
-            ValueError: for a field that is missing or has a wrong shape or type, or a value that is not finite.
+            ValueError: for a field that is missing or has a wrong shape or type, a value that is not finite, or an
+                action that the environment does not allow.
         """
         return self._adapt(params, check_demo(demo, self.spec))
 
@@ -109,6 +111,8 @@ def check_demo(demo: Demo, spec: Spec) -> Demo:
     Raises:
         ValueError: naming the field, what came and what was expected.
     """
+    if not isinstance(demo, Demo):
+        raise ValueError(f"demo: got {type(demo).__name__}, expected a milx.Demo")
     action = _as_array("demo.action", demo.action)
     lead = action.ndim - 2
     if lead not in (0, 1) or 0 in action.shape:
@@ -120,6 +124,11 @@ def check_demo(demo: Demo, spec: Spec) -> Demo:
         state=_check_vector("demo.state", demo.state, (*shape, spec.state_size)),
         action=_check_vector("demo.action", action, (*shape, spec.action_size)),
     )
+    low, high = spec.action_range
+    if outside := np.argwhere((checked.action < low) | (checked.action > high)).tolist():
+        index = tuple(outside[0])
+        limits = f"at least {low[index[-1]]} and at most {high[index[-1]]}"
+        raise ValueError(f"demo.action: got {checked.action[index]} at {index}, expected {limits}")
     return checked if lead else jax.tree.map(lambda x: x[None], checked)
 
 
@@ -129,6 +138,8 @@ def check_observation(observation: Observation, spec: Spec) -> Observation:
     Raises:
         ValueError: naming the field, what came and what was expected.
     """
+    if not isinstance(observation, Observation):
+        raise ValueError(f"observation: got {type(observation).__name__}, expected a milx.Observation")
     return Observation(
         image=_check_image("observation.image", observation.image, (*spec.image_shape, 3)),
         state=_check_vector("observation.state", observation.state, (spec.state_size,)),

@@ -1,7 +1,6 @@
 """One run, from nothing to an evaluated policy, in one folder; started again, it continues where it stopped.
 
 config.json             the configuration
-demos/*.npz             expert demonstrations of each split
 checkpoints/            the latest and the best by validation success
 metrics.jsonl           one line for every log and validation; events.* hold the same for TensorBoard
 evaluation.json         success on held-out tasks, with floors and ceiling
@@ -11,6 +10,7 @@ learning_curve.png, rollouts.gif
 import contextlib
 import json
 import pathlib
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -23,7 +23,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from tensorboardX import SummaryWriter
 
 from milx import config as config_lib
-from milx import envs, evaluator, methods, platform, provenance, report, whitening
+from milx import envs, evaluator, methods, parallel, platform, provenance, report, whitening
 from milx.checkpoint import Checkpoints
 from milx.config import Config
 from milx.data import demos as demos_lib
@@ -64,18 +64,27 @@ class Run:
         console: where to report progress.
 
     Raises:
-        ValueError: if the folder holds a run of another configuration (the message shows the difference), or the steps
-            are not whole numbers of scans.
+        ValueError: if the folder holds a run of another configuration (the message shows the difference), the steps are
+            not whole numbers of scans, or the tasks of a meta-batch cannot be shared evenly by the devices.
     """
 
     def __init__(self, config: Config, workdir: str | pathlib.Path, console: Console | None = None):
         self.config = config
         self.folder = pathlib.Path(workdir)
-        self.console = console or Console()
+        self.console = console or Console(quiet=not parallel.is_first_host())
+        self._checkpoints = self.folder / "checkpoints"
+        if not parallel.is_first_host():  # its copies of the other files are the same, and not needed
+            self.folder = pathlib.Path(tempfile.mkdtemp())
+        if config.data.demos_per_task <= config.train.shots:
+            expected = f"more than train.shots = {config.train.shots}: another one is the query"
+            raise ValueError(f"data.demos_per_task: got {config.data.demos_per_task}, expected {expected}")
         for name in ("steps", "eval_every"):
             value, scan = getattr(config.train, name), config.train.log_every
             if value < 1 or value % scan:
                 raise ValueError(f"train.{name}: got {value}, expected a positive multiple of train.log_every = {scan}")
+        if config.train.meta_batch % parallel.num_devices():
+            expected = f"a multiple of the {parallel.num_devices()} devices"
+            raise ValueError(f"train.meta_batch: got {config.train.meta_batch}, expected {expected}")
         self.env = envs.make(config.env_name, config.env.image_shape)
         self.method = methods.make(config, spec_of(self.env))
         self.trainer = Trainer(
@@ -88,13 +97,13 @@ class Run:
     def train(self) -> None:
         """Meta-trains to the configured number of steps, from the latest checkpoint if there is one."""
         config = self.config.train
-        checkpoints = Checkpoints(self.folder / "checkpoints")
+        checkpoints = Checkpoints(self._checkpoints)
         if (checkpoints.latest or 0) >= config.steps:
             return checkpoints.close()
         compiled = self._compile_in_background()
         train, validation = self.demos("train"), self.demos("validation")
-        state, key = self._start(train, checkpoints)
         dataset_hash = demos_lib.fingerprint(train)
+        state, key = self._start(train, dataset_hash, checkpoints)
         with self._clock("compile"):
             run_steps = compiled.result()
         metrics = MetricsWriter(self.folder, int(state.step))
@@ -126,7 +135,7 @@ class Run:
         Raises:
             ValueError: if there is no checkpoint yet.
         """
-        checkpoints = Checkpoints(self.folder / "checkpoints", read_only=True)
+        checkpoints = Checkpoints(self._checkpoints, read_only=True)
         step = checkpoints.best
         if step is None or checkpoints.latest is None:
             raise ValueError(f"workdir: {self.folder} has no checkpoint yet; train first")
@@ -139,7 +148,7 @@ class Run:
             trials = evaluator.run_trials(self.env, self.method, items["params"], test, config, key)
             floors = evaluator.baselines(self.env, test, config, self.config.data, key)
         result = self._result(evaluator.summary(trials.success), floors, step, extra["dataset_hash"])
-        (self.folder / "evaluation.json").write_text(json.dumps(result, indent=1) + "\n")
+        _write_json(self.folder / "evaluation.json", result)
         report.learning_curve(
             report.read_metrics(self.folder / "metrics.jsonl"), result, self.folder / "learning_curve.png"
         )
@@ -187,7 +196,7 @@ class Run:
         thread.shutdown(wait=False)
         return compiled
 
-    def _start(self, train: DemoSet, checkpoints: Checkpoints) -> tuple[TrainState, jax.Array]:
+    def _start(self, train: DemoSet, dataset_hash: str, checkpoints: Checkpoints) -> tuple[TrainState, jax.Array]:
         """The state to train from, and the key of the batches."""
         init_key, batch_key = jax.random.split(jax.random.fold_in(jax.random.key(self.config.seed), 3))
         seen = jax.jit(jax.vmap(jax.vmap(jax.vmap(self.env.robot_state))))(train.states)
@@ -196,6 +205,12 @@ class Run:
         if checkpoints.latest is not None:
             like = {"params": state.params, "trainer": (state.step, state.optimizer)}
             items, extra = checkpoints.restore(checkpoints.latest, like)
+            if extra["dataset_hash"] != dataset_hash:
+                old, new = extra["dataset_hash"][:12], dataset_hash[:12]
+                raise ValueError(
+                    f"workdir: {self.folder} was trained on demonstrations {old}, but this device and these versions "
+                    f"plan {new}; expected the device and versions that began the run, or another folder"
+                )
             self.seconds = extra["seconds"]
             step, optimizer = items["trainer"]
             state = TrainState(step, items["params"], optimizer)
@@ -225,7 +240,7 @@ class Run:
             "env": config.env_name,
             "method": config.method_name,
             "preset": config.preset,
-            "variant": "",
+            "variant": ", ".join(f"{name}={value}" for name, value in config_lib.overrides(config).items()),
             "seed": config.seed,
             "num_tasks_train": config.data.tasks,
             "num_demos_train": config.data.tasks * config.data.demos_per_task,
@@ -252,7 +267,7 @@ class Run:
             if changed:
                 raise ValueError(f"workdir: {self.folder} holds another run: {'; '.join(changed)}")
         else:
-            path.write_text(json.dumps(mine, indent=1) + "\n")
+            _write_json(path, mine)
 
     @contextlib.contextmanager
     def _clock(self, name: str) -> Iterator[None]:
@@ -277,6 +292,13 @@ class Run:
             TimeRemainingColumn(),
         )
         return Progress(*columns, console=self.console)
+
+
+def _write_json(path: pathlib.Path, values: dict[str, Any]) -> None:
+    """Writes a file as a whole: a process that is killed leaves the old one or the new one."""
+    partial = path.with_suffix(".partial")
+    partial.write_text(json.dumps(values, indent=1) + "\n")
+    partial.replace(path)
 
 
 class MetricsWriter:

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from milx import parallel
 from milx.config import OptimizerConfig, TrainConfig
 from milx.data.demos import DemoSet, sample_batch
 from milx.envs.base import Env
@@ -38,11 +39,9 @@ class TrainState:
 
 def make_optimizer(config: OptimizerConfig, steps: int) -> optax.GradientTransformation:
     """Adam with the configured schedule over `steps` meta-updates, after clipping the global norm."""
-    warmup = round(config.warmup * steps)
-    if config.cosine:
-        rate = optax.warmup_cosine_decay_schedule(0.0, config.learning_rate, warmup, steps)
-    else:
-        rate = optax.warmup_constant_schedule(0.0, config.learning_rate, warmup)
+    peak, warmup = config.learning_rate, round(config.warmup * steps)
+    then = optax.cosine_decay_schedule(peak, steps - warmup) if config.cosine else optax.constant_schedule(peak)
+    rate = optax.join_schedules([optax.linear_schedule(0.0, peak, max(warmup, 1)), then], [warmup])
     clip = optax.identity() if config.clip_norm is None else optax.clip_by_global_norm(config.clip_norm)
     return optax.chain(clip, optax.adam(rate))
 
@@ -70,19 +69,19 @@ class Trainer:
 
     def update(self, state: TrainState, demos: DemoSet, key: jax.Array) -> tuple[TrainState, dict[str, jax.Array]]:
         """One meta-update on the batch of (key, state.step)."""
-        batch = sample_batch(
-            self.env,
-            demos,
-            jax.random.fold_in(key, state.step),
-            meta_batch=self.train.meta_batch,
-            shots=self.train.shots,
-            support_frames=self.train.support_frames,
-            query_frames=self.train.query_frames,
-        )
-        (loss, metrics), grad = jax.value_and_grad(self.method.loss, has_aux=True)(state.params, batch)
+
+        def gradient(params: Params, demos: DemoSet, keys: jax.Array) -> tuple[Params, dict[str, jax.Array]]:
+            train = self.train
+            frames = train.support_frames, train.query_frames
+            batch = sample_batch(self.env, demos, keys, train.shots, *frames, train.redraw_appearance)
+            (loss, metrics), grad = jax.value_and_grad(self.method.loss, has_aux=True)(params, batch)
+            return grad, {"loss": loss, **metrics}
+
+        keys = jax.random.split(jax.random.fold_in(key, state.step), self.train.meta_batch)
+        grad, metrics = parallel.split_tasks(gradient, shared=2, average=True)(state.params, demos, keys)
         updates, optimizer = self.optimizer.update(grad, state.optimizer, state.params)
         params = optax.apply_updates(state.params, updates)
-        metrics = {"loss": loss, "grad_norm": optax.global_norm(grad), **metrics}
+        metrics["grad_norm"] = optax.global_norm(grad)
         return TrainState(state.step + 1, params, optimizer), metrics
 
     @functools.partial(jax.jit, static_argnums=(0, 4))

@@ -49,11 +49,6 @@ class Demo:
     state: Array = None
     action: Array = None
 
-    @property
-    def observation(self) -> Observation:
-        """The images and states as a batch of observations."""
-        return Observation(image=self.image, state=self.state)
-
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)

@@ -70,7 +70,7 @@ def test_unknown_env_or_preset_is_refused_and_the_valid_ones_listed(arguments, m
 
 
 def test_unknown_method_is_refused_and_the_valid_ones_listed():
-    spec = Spec(image_shape=(8, 10), state_size=4, action_size=2, goal_indices=(0,))
+    spec = Spec(image_shape=(8, 10), state_size=4, action_size=2, action_range=((-1, -1), (1, 1)), goal_indices=(0,))
     with pytest.raises(ValueError, match=re.escape("method: got 'nope', expected one of mil")):
         methods.make(make_config("reach", "nope"), spec)
 
@@ -85,6 +85,22 @@ def test_differences_name_the_fields():
         "network.filters was (24, 24), now (1, 2)",
         "train.meta_batch was 8, now 9",
     ]
+
+
+def test_overrides_are_what_differs_from_the_preset():
+    config = make_config("reach", preset="cpu", seed=3)
+    assert config_lib.overrides(config) == {}
+    config.network.filters, config.mil.inner_steps = (1, 2), 5
+    assert config_lib.overrides(config) == {"network.filters": (1, 2), "mil.inner_steps": 5}
+
+
+def test_only_optional_fields_can_be_unset():
+    config = make_config("reach", preset="cpu")
+    assert config.train.support_frames is not None
+    config_lib.unset(config, "train.support_frames")
+    assert config.train.support_frames is None
+    with pytest.raises(ValueError, match=r"config\.train\.steps: got None, expected a value"):
+        config_lib.unset(config, "train.steps")
 
 
 def test_flatten_joins_names_with_dots():

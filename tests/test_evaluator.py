@@ -28,7 +28,7 @@ def test_wilson_interval_against_known_values(successes, trials):
     np.testing.assert_allclose(evaluator.wilson_interval(successes, trials), KNOWN[successes, trials], atol=5e-5)
 
 
-@pytest.mark.parametrize("trials", [1, 7, 150, 1500])
+@pytest.mark.parametrize("trials", [1, 4, 7, 10, 50, 150, 200, 600, 1500])
 def test_wilson_interval_against_scipy(trials):
     for successes in {0, 1, trials // 3, trials - 1, trials}:
         expected = scipy.stats.binomtest(successes, trials).proportion_ci(method="wilson")
@@ -94,6 +94,45 @@ def test_no_trial_takes_place_in_the_demonstration_s_scene(trained, split, monke
     between = np.abs(flat[:, None] - flat).max(axis=-1) + np.eye(30)
     assert between.min() > 0.01, "no two trials share a scene"
     np.testing.assert_array_equal(scene.qpos, 0)
+
+
+@pytest.mark.parametrize(("trials", "asked", "tried"), [(3, 1, 1), (2, 2, 2), (2, 10, 2)])
+def test_baselines_run_in_the_first_trials(trained, monkeypatch, trials, asked, tried):
+    env, key = trained.run.env, run_lib._trial_key("test")
+    config = dataclasses.replace(trained.config.evaluation, trials=trials, baseline_trials=asked)
+    asked_for = {}
+
+    def watch(env, task, scene, keys, options, noise):
+        asked_for.update(task=task, scene=scene)
+        assert noise == 0.0
+        return jax.tree.map(lambda x: jnp.repeat(x[:, None], env.horizon + 1, axis=1), scene), None
+
+    monkeypatch.setattr(evaluator, "perform", watch)
+    plans = dataclasses.replace(trained.config.data, plan_batch=2 * 3 * tried)
+    rates = evaluator.baselines(env, trained.test, config, plans, key)
+    scene = evaluator.trial_scenes(env, trained.test.task, jax.random.split(key)[0], trials)
+    expected = jax.tree.map(lambda x: x[:, :tried].reshape(-1, *x.shape[2:]), scene)
+    twice = jax.tree.map(lambda x: jnp.concatenate([x, x]), expected)
+    jax.tree.map(np.testing.assert_array_equal, asked_for["scene"], twice)
+    targets = np.asarray(asked_for["task"].target).reshape(2, 3, tried)
+    np.testing.assert_array_equal(targets[1], np.repeat(trained.test.task.target[:, None], tried, axis=1))
+    # Nobody moves, so both experts fare as the arm at rest does, judged by the true target.
+    resting = jax.tree.map(lambda x: jnp.repeat(x[:, None], env.horizon + 1, axis=1), expected)
+    task = jax.tree.map(lambda x: jnp.repeat(x, tried, axis=0), trained.test.task)
+    rate = float(jax.vmap(env.success)(task, resting).mean())
+    assert rates["expert"] == rates["task_blind"] == pytest.approx(rate)
+
+
+def test_programs_compiled_ahead_are_found(trained, caplog):
+    method, config = Replay(), dataclasses.replace(trained.config.evaluation, trials=4)
+    compiled = []
+    with jax.log_compiles():
+        evaluator.precompile(trained.run.env, method, (), config)
+        compiled.append("XLA compilation of jit(_run_batch)" in caplog.text)
+        caplog.clear()
+        evaluator.run_trials(trained.run.env, method, (), trained.test, config, jax.random.key(0))
+        compiled.append("XLA compilation of jit(_run_batch)" in caplog.text)
+    assert compiled == [True, False]
 
 
 def test_validation_and_test_trials_differ(trained):

@@ -41,7 +41,7 @@ def good_demo():
     return milx.Demo(
         image=rng.integers(0, 256, (T, H, W, 3), dtype=np.uint8),
         state=rng.standard_normal((T, S)).astype(np.float32),
-        action=rng.standard_normal((T, A)).astype(np.float32),
+        action=rng.uniform(-1, 1, (T, A)).astype(np.float32),
     )
 
 
@@ -118,6 +118,10 @@ BAD_DEMOS = {
         lambda d: {"action": with_entry(d.action, (2, 0), -np.inf)},
         "demo.action: got -inf at (2, 0), expected finite numbers",
     ),
+    "action out of range": (
+        lambda d: {"action": with_entry(d.action, (2, 1), 1.5)},
+        "demo.action: got 1.5 at (2, 1), expected at least -1.0 and at most 1.0",
+    ),
     "no time steps": (
         lambda d: {"image": d.image[:0], "state": d.state[:0], "action": d.action[:0]},
         f"demo.action: got shape [0, {A}], expected [T, A] or [K, T, A] with at least one time step",
@@ -151,6 +155,13 @@ def test_bad_demonstration_is_refused(policy, case):
     with pytest.raises(ValueError, match="^" + re.escape(message)) as error:
         policy.adapt(policy.params, bad)
     assert "expected" in str(error.value)
+
+
+def test_something_else_than_a_record_is_refused(policy, task_params):
+    with pytest.raises(ValueError, match=r"demo: got dict, expected a milx\.Demo"):
+        policy.adapt(policy.params, dataclasses.asdict(good_demo()))
+    with pytest.raises(ValueError, match=r"observation: got NoneType, expected a milx\.Observation"):
+        policy.act(task_params, None)
 
 
 def test_the_same_demonstration_without_the_fault_is_accepted(policy):

@@ -3,13 +3,16 @@
 import dataclasses
 import hashlib
 import json
+import os
 import pathlib
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
+from milx import parallel
 from milx.chunks import map_in_chunks
 from milx.config import DataConfig
 from milx.envs.base import SPLITS, Env, State, Task
@@ -106,23 +109,22 @@ def render_demo(env: Env, task: Task, states: State, action: jax.Array, index: j
 def sample_batch(
     env: Env,
     demos: DemoSet,
-    key: jax.Array,
-    *,
-    meta_batch: int,
+    keys: jax.Array,
     shots: int,
     support_frames: int | None = None,
     query_frames: int | None = None,
+    redraw_appearance: bool = False,
 ) -> TaskBatch:
     """Draws tasks and different demonstrations of each, and renders them.
 
     Args:
         env: the environment that renders.
         demos: where to draw from.
-        key: the batch is a function of this key.
-        meta_batch: N, tasks, drawn with replacement.
+        keys: [N] keys; each draws one task, with replacement.
         shots: K, support demonstrations; one more of the same task becomes the query.
         support_frames: time steps drawn from each support demonstration; None for all.
         query_frames: time steps drawn from the query demonstration; None for all.
+        redraw_appearance: show the demonstrations of a task in a new appearance of the training split.
     """
 
     def sample_task(key: jax.Array) -> TaskBatch:
@@ -130,6 +132,8 @@ def sample_batch(
         n = jax.random.randint(task_key, (), 0, demos.num_tasks)
         chosen = jax.random.choice(demo_key, demos.num_demos, (shots + 1,), replace=False)
         task = jax.tree.map(lambda x: x[n], demos.task)
+        if redraw_appearance:
+            task = env.redraw_appearance(jax.random.fold_in(key, 1), task)
 
         def load(d: jax.Array, key: jax.Array, frames: int | None) -> Demo:
             states, action = jax.tree.map(lambda x: x[n, d], (demos.states, demos.action))
@@ -141,7 +145,7 @@ def sample_batch(
             support=jax.tree.map(lambda *xs: jnp.stack(xs), *support), query=jax.tree.map(lambda x: x[None], query)
         )
 
-    return jax.vmap(sample_task)(jax.random.split(key, meta_batch))
+    return jax.vmap(sample_task)(keys)
 
 
 def shapes(env: Env, num_tasks: int, num_demos: int) -> DemoSet:
@@ -167,15 +171,17 @@ def cached(
 ) -> DemoSet:
     """`collect`, or what it gave before: sets are kept in `folder` under a hash of all that they depend on.
 
-    The hash covers the arguments, the kind of device, and the sources of environments and experts.
+    The hash covers the arguments, the kind of device, the versions of JAX and MuJoCo, and the sources of environments
+    and experts. How many demonstrations are planned at once is left out: it changes no more than rounding.
     """
     request = [env.name, seed, split, num_tasks, num_demos, config.noise, config.plan_iterations, jax.default_backend()]
-    digest = hashlib.sha256(json.dumps(request).encode())
+    digest = hashlib.sha256(json.dumps([*request, jax.__version__, mujoco.__version__]).encode())
     root = pathlib.Path(__file__).parents[1]
-    for source in sorted([*root.glob("envs/**/*.py"), *root.glob("envs/**/*.xml"), *root.glob("trajopt/*.py")]):
+    patterns = ("envs/**/*.py", "envs/**/*.xml", "trajopt/*.py", "data/demos.py")
+    for source in sorted(path for pattern in patterns for path in root.glob(pattern)):
         digest.update(source.read_bytes())
     path = folder / f"{env.name}-{split}-{digest.hexdigest()[:16]}.npz"
-    if path.is_file():
+    if parallel.on_all_hosts(path.is_file()):
         return load(path, like=shapes(env, num_tasks, num_demos))
     demos = collect(env, jax.random.key(seed), split, num_tasks, num_demos, config)
     save(path, demos)
@@ -201,7 +207,7 @@ def fingerprint(demos: DemoSet) -> str:
 def save(path: pathlib.Path, demos: DemoSet) -> None:
     """Writes a set as one .npz file; a file of that name is replaced only once the new one is complete."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_suffix(".partial.npz")
+    partial = path.with_suffix(f".partial{os.getpid()}.npz")
     arrays: dict[str, Any] = {name: np.asarray(leaf) for name, leaf in leaves(demos).items()}
     np.savez_compressed(partial, **arrays)
     partial.replace(path)

@@ -102,6 +102,10 @@ class Env(abc.ABC):
         """Draws a task of a split ("train", "validation" or "test"); raises ValueError for another split."""
 
     @abc.abstractmethod
+    def redraw_appearance(self, key: jax.Array, task: Task) -> Task:
+        """The task with another appearance of the training split; its demonstrations are valid for both."""
+
+    @abc.abstractmethod
     def reset(self, key: jax.Array, task: Task) -> State:
         """Draws a scene of the task: the state at the start of an episode."""
 
@@ -128,14 +132,6 @@ class Env(abc.ABC):
     @abc.abstractmethod
     def task_blind(self, key: jax.Array, task: Task) -> Task:
         """The task as someone understands it who saw no demonstration: a random candidate is the target."""
-
-    def running_cost(self, task: Task, state: State, action: jax.Array, t: jax.Array) -> jax.Array:
-        """Scalar cost of one step: half the square of the running residual."""
-        return 0.5 * jnp.sum(self.running_residual(task, state, action, t) ** 2)
-
-    def terminal_cost(self, task: Task, state: State) -> jax.Array:
-        """Scalar cost of the final state: half the square of the terminal residual."""
-        return 0.5 * jnp.sum(self.terminal_residual(task, state) ** 2)
 
     def data(self, state: State) -> mjx.Data:
         """MJX data holding this state; derived quantities are not computed yet."""

@@ -69,10 +69,12 @@ class Reach(Env):
         """Draws three different colours from the split's grid, and the target among them."""
         check_split(split)
         color_key, target_key = jax.random.split(key)
-        index = jax.random.choice(color_key, 1000, (NUM_OBJECTS,), replace=False)
-        grid = jnp.stack([index // 100, index // 10 % 10, index % 10], axis=-1).astype(jnp.float32)
         target = jax.random.randint(target_key, (), 0, NUM_OBJECTS)
-        return ReachTask(object_color=grid * 0.1 + COLOR_OFFSETS[split], target=target)
+        return ReachTask(object_color=_draw_colors(color_key, split), target=target)
+
+    def redraw_appearance(self, key: jax.Array, task: ReachTask) -> ReachTask:
+        """The same target among other colours of the training grid."""
+        return dataclasses.replace(task, object_color=_draw_colors(key, "train"))
 
     def reset(self, key: jax.Array, task: ReachTask) -> State:
         """Stands the arm at zero and the cubes uniformly in the arena, at least SPACING apart."""
@@ -134,3 +136,10 @@ class Reach(Env):
     def task_blind(self, key: jax.Array, task: ReachTask) -> ReachTask:
         """The task with a random cube as the target."""
         return dataclasses.replace(task, target=jax.random.randint(key, (), 0, NUM_OBJECTS))
+
+
+def _draw_colors(key: jax.Array, split: str) -> jax.Array:
+    """[3, 3] three different colours of the split's grid."""
+    index = jax.random.choice(key, 1000, (NUM_OBJECTS,), replace=False)
+    grid = jnp.stack([index // 100, index // 10 % 10, index % 10], axis=-1).astype(jnp.float32)
+    return grid * 0.1 + COLOR_OFFSETS[split]

@@ -19,12 +19,14 @@ class Spec:
         image_shape: (H, W).
         state_size: S.
         action_size: A.
+        action_range: lowest and highest entry of each action.
         goal_indices: entries of the state that tell, at the end of a demonstration, where it went.
     """
 
     image_shape: tuple[int, int]
     state_size: int
     action_size: int
+    action_range: tuple[tuple[float, ...], tuple[float, ...]]
     goal_indices: tuple[int, ...]
 
 

@@ -26,11 +26,11 @@ from milx.whitening import Whitening
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
 def gradient(loss: Callable[..., jax.Array], theta: Params, *data: Any) -> Params:
-    """The gradient of loss(theta, *data), differentiable in theta; `data` counts as constant.
+    """The gradient of loss(theta, *data), once more differentiable in theta (in reverse); `data` counts as constant.
 
-    Its derivative is a product of the Hessian with a vector. As the Hessian is symmetric, the product may be taken
-    forward over reverse, which keeps no intermediate results of the inner gradient for the meta-gradient (Pearlmutter
-    1994), where reverse over reverse keeps them all.
+    Its derivative is a product of the Hessian with a vector. As the Hessian is symmetric (so `loss` must not stop
+    gradients of theta), the product may be taken forward over reverse, which keeps no intermediate results of the inner
+    gradient for the meta-gradient (Pearlmutter 1994), where reverse over reverse keeps them all.
     """
     return jax.grad(loss)(theta, *data)
 

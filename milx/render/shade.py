@@ -36,7 +36,7 @@ class Lights(NamedTuple):
     direction: jax.Array  # [L, 3] the way the light shines
     position: jax.Array  # [L, 4] homogeneous: (x, y, z, 1) m, or against the direction and 0 for a directional light
     attenuation: jax.Array  # [L, 3] coefficients of 1, distance and distance squared
-    cutoff: jax.Array  # [L] least cosine to the direction that is lit: -1 for any but spot lights
+    cutoff: jax.Array  # [L] least cosine to the direction that is lit: below -1 for any but spot lights
     exponent: jax.Array  # [L] of that cosine: 0 for any but spot lights
 
 

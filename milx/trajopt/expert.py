@@ -9,6 +9,7 @@ import functools
 import jax
 import jax.numpy as jnp
 
+from milx import parallel
 from milx.envs.base import Env, State, Task
 from milx.trajopt.ilqr import Options, Plan, Problem, solve
 
@@ -53,7 +54,7 @@ def perform(
 ) -> tuple[State, jax.Array]:
     """Plans and demonstrates a batch: `task`, `state` and `key` have a leading axis; so have the results."""
 
-    def one(task: Task, state: State, key: jax.Array) -> tuple[State, jax.Array]:
+    def one(noise: float, task: Task, state: State, key: jax.Array) -> tuple[State, jax.Array]:
         return demonstrate(env, task, state, plan(env, task, state, options), key, noise)
 
-    return jax.vmap(one)(task, state, key)
+    return parallel.split_tasks(jax.vmap(one, in_axes=(None, 0, 0, 0)), shared=1)(noise, task, state, key)

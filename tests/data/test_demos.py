@@ -168,7 +168,7 @@ def draw(trained):
     """One-shot batches of MANY tasks with every state; images are left out, which spares their rendering."""
 
     def batch(key):
-        drawn = demos_lib.sample_batch(trained.run.env, trained.train, key, meta_batch=MANY, shots=1)
+        drawn = demos_lib.sample_batch(trained.run.env, trained.train, jax.random.split(key, MANY), shots=1)
         return dataclasses.replace(
             drawn,
             support=dataclasses.replace(drawn.support, image=None),

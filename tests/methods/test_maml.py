@@ -11,6 +11,7 @@ import pytest
 
 from milx import methods
 from milx.config import Config, MILConfig, NetworkConfig
+from milx.methods import maml
 from milx.methods.maml import MIL
 from milx.networks.policy import PolicyNetwork, PolicyOutput, make_policy
 from milx.types import Demo, Observation, TaskBatch
@@ -331,7 +332,29 @@ def test_imitating_its_own_actions_is_without_loss(batch):
         assert law(loss), f"inner {inner}: {loss}"
 
 
+def test_meta_gradient_is_that_of_reverse_over_reverse(batch, monkeypatch):
+    method, params = build(inner_steps=2, inner_clip=0.05, learn_inner_lr=True)
+    grads = {}
+    for name in ("forward over reverse", "reverse over reverse"):
+        grads[name] = jax.jit(jax.grad(lambda params: method.loss(params, batch)[0]))(params)
+        monkeypatch.setattr(maml, "gradient", lambda loss, theta, *data: jax.grad(loss)(theta, *data))
+    found, expected = grads.values()
+    assert_trees_close(found["policy"], expected["policy"])
+    assert_trees_close(found["inner_log_lr"], expected["inner_log_lr"])
+
+
+def test_mixed_precision_keeps_the_meta_gradient_and_its_type(batch):
+    method, params = build(inner_lr=0.01)
+    mixed, _ = build({"mixed_precision": True}, inner_lr=0.01)
+    exact, rough = (jax.jit(jax.grad(lambda params, m=m: m.loss(params, batch)[0]))(params) for m in (method, mixed))
+    flat = [jnp.concatenate([leaf.ravel() for leaf in jax.tree.leaves(grad["policy"])]) for grad in (exact, rough)]
+    assert flat[1].dtype == jnp.float64
+    # bfloat16 keeps 8 bits: each product is off by up to 2^-8, and two convolutions follow each other.
+    distance = jnp.linalg.norm(flat[1] - flat[0]) / jnp.linalg.norm(flat[0])
+    assert 1e-5 < distance < 0.05
+
+
 def test_an_unknown_method_is_told_the_known_ones():
-    spec = methods.Spec(IMAGE_SHAPE, STATE, ACTION, GOAL_INDICES)
+    spec = methods.Spec(IMAGE_SHAPE, STATE, ACTION, ((-1,) * ACTION, (1,) * ACTION), GOAL_INDICES)
     with pytest.raises(ValueError, match="method: got 'maml', expected one of mil"):
         methods.make(Config(method_name="maml"), spec)

@@ -1,0 +1,160 @@
+"""The same numbers on one device, on two, on four, and on two hosts.
+
+The devices are virtual ones of the CPU, and the hosts are processes that talk over loopback. They need XLA flags of
+their own, so this file is also the program that the tests start (see `work`).
+"""
+
+import dataclasses
+import json
+import os
+import pathlib
+import re
+import socket
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+STEPS = 50
+
+
+def random_demos(env, num_tasks, num_demos):
+    """Wanderings, where nobody planned anything: rendering and learning ask for no more."""
+    import jax
+
+    from milx.data import demos as demos_lib
+
+    rng = np.random.default_rng(0)
+    like = demos_lib.shapes(env, num_tasks, num_demos)
+    task = jax.vmap(env.sample_task, in_axes=(0, None))(jax.random.split(jax.random.key(1), num_tasks), "train")
+    draw = lambda x: jax.numpy.asarray(0.2 * rng.standard_normal(x.shape), x.dtype)  # noqa: E731
+    return dataclasses.replace(jax.tree.map(draw, like), task=task)
+
+
+def measure(num_devices, everything):
+    """Losses of 50 meta-updates on the first `num_devices` devices; if asked, also trials and planned actions."""
+    import jax
+    from conftest import tiny_config
+    from jax.sharding import Mesh
+
+    from milx import envs, evaluator, methods, parallel
+    from milx.policy import spec_of
+    from milx.trainer import Trainer, make_optimizer
+    from milx.trajopt.expert import perform
+    from milx.trajopt.ilqr import Options
+    from milx.whitening import Whitening
+
+    parallel.mesh = lambda: Mesh(jax.devices()[:num_devices], (parallel.AXIS,))
+    config = tiny_config()
+    config.train.meta_batch = 4
+    env = envs.make("reach", (16, 20))
+    method = methods.make(config, spec_of(env))
+    trainer = Trainer(env, method, config.train, make_optimizer(config.optimizer, STEPS))
+    demos = random_demos(env, 5, 2)
+    flat = Whitening(*(np.full(n, v, np.float32) for n, v in ((8, 0), (8, 1), (2, 0), (2, 1))))
+    key = jax.random.key(2)
+    state = jax.jit(trainer.init)(key, flat)
+    after, metrics = jax.jit(
+        lambda state, demos: jax.lax.scan(lambda s, _: trainer.update(s, demos, key), state, length=STEPS)
+    )(state, demos)
+    found = {"losses": np.asarray(metrics["loss"]).tolist(), "step": int(after.step)}
+    if everything:
+        config.evaluation.batch = config.evaluation.trials = 3
+        trials = evaluator.run_trials(env, method, state.params, demos, config.evaluation, key)
+        found["trials"] = np.asarray(trials.states.qpos).tolist()
+        start = jax.tree.map(lambda x: x[:4, 0, 0], demos.states)
+        task = jax.tree.map(lambda x: x[:4], demos.task)
+        _, action = perform(env, task, start, jax.random.split(key, 4), Options(iterations=2), 0.01)
+        found["action"] = np.asarray(action).tolist()
+    return found
+
+
+def work(arguments):
+    """Runs in a process of its own: `devices 1,2,4`, or `host ID ADDRESS FOLDER`."""
+    if arguments[0] == "devices":
+        counts = [int(n) for n in arguments[1].split(",")]
+        return {n: measure(n, everything=n in (1, 4)) for n in counts}
+    from milx import parallel
+
+    parallel.join_hosts(arguments[2], 2, int(arguments[1]))
+    from conftest import QUIET, tiny_config
+
+    from milx.run import Run
+
+    run = Run(tiny_config(), arguments[3], QUIET)
+    run.train()
+    result = run.evaluate()
+    lines = [json.loads(line) for line in (run.folder / "metrics.jsonl").open()]
+    return {"metrics": lines, "success": result["success"], "baselines": result["baselines"], **measure(2, False)}
+
+
+def start(num_devices, *arguments, **environment):
+    flags = re.sub(r"--xla_force_host_platform_device_count=\S+", "", os.environ.get("XLA_FLAGS", ""))
+    flags += f" --xla_force_host_platform_device_count={num_devices}"
+    env = {**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", **environment}
+    return subprocess.Popen(
+        [sys.executable, __file__, *map(str, arguments)],
+        env=env,
+        cwd=pathlib.Path(__file__).parent,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def answer(process):
+    out, err = process.communicate(timeout=900)
+    assert process.returncode == 0, err[-3000:]
+    return json.loads(out.splitlines()[-1])
+
+
+@pytest.fixture(scope="module")
+def devices(cache):
+    return answer(start(4, "devices", "1,2,4"))
+
+
+@pytest.fixture(scope="module")
+def hosts(cache, tmp_path_factory):
+    """Two processes that make one run together, each with a cache of demonstrations of its own."""
+    folder = tmp_path_factory.mktemp("hosts")
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        address = f"localhost:{free.getsockname()[1]}"
+    caches = [{"XDG_CACHE_HOME": str(folder / f"cache{i}")} for i in range(2)]
+    both = [start(1, "host", i, address, folder / "run", **caches[i]) for i in range(2)]
+    return [answer(process) for process in both]
+
+
+@pytest.mark.parametrize("count", ["2", "4"])
+def test_losses_of_fifty_updates_do_not_depend_on_the_number_of_devices(devices, count):
+    one, many = devices["1"], devices[count]
+    assert one["step"] == many["step"] == STEPS
+    assert len(set(one["losses"])) == STEPS, "every batch is another one"
+    np.testing.assert_allclose(many["losses"], one["losses"], rtol=1e-5)
+
+
+def test_demonstrations_and_trials_do_not_depend_on_the_number_of_devices(devices):
+    for name in ("trials", "action"):
+        np.testing.assert_allclose(devices["4"][name], devices["1"][name], atol=1e-4)
+        assert np.std(devices["1"][name]) > 1e-3
+
+
+def test_two_hosts_have_the_losses_of_one_device(devices, hosts):
+    for host in hosts:
+        np.testing.assert_allclose(host["losses"], devices["1"]["losses"], rtol=1e-5)
+
+
+def test_two_hosts_make_one_run_as_one_host_makes_it(hosts, trained):
+    for host in hosts:
+        assert len(host["metrics"]) == len(trained.metrics)
+        for line, expected in zip(host["metrics"], trained.metrics, strict=True):
+            assert line["step"] == expected["step"]
+            for name in set(expected) - {"step", "steps_per_s"}:
+                np.testing.assert_allclose(line[name], expected[name], rtol=2e-4)
+        assert host["success"] == trained.result["success"]
+        assert host["baselines"] == trained.result["baselines"]
+
+
+if __name__ == "__main__":
+    print(json.dumps(work(sys.argv[1:])))
