@@ -204,7 +204,7 @@ def _reach_cpu() -> Config:
     config.network.filters = (32, 32, 32)
     config.network.fc_layers = (100, 100)
     config.train = TrainConfig(
-        steps=20_000, meta_batch=16, support_frames=3, query_frames=3, redraw_appearance=True, eval_every=4000
+        steps=22_000, meta_batch=8, support_frames=3, query_frames=3, redraw_appearance=True, eval_every=4400
     )
     config.evaluation.validation_tasks = 25
     config.evaluation.baseline_trials = 1

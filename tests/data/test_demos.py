@@ -205,6 +205,27 @@ def test_support_and_query_are_different_demonstrations_of_one_task(trained, dra
     assert len(pairs) == 6
 
 
+def test_a_redrawn_batch_shows_the_same_demonstrations_in_the_colours_of_its_tasks(trained):
+    env, keys = trained.run.env, jax.random.split(jax.random.key(6), 3)
+    batches = [
+        jax.jit(lambda keys, redraw=redraw: demos_lib.sample_batch(env, trained.train, keys, 1, 2, 2, redraw))(keys)
+        for redraw in (False, True)
+    ]
+    plain, redrawn = batches
+    for a, b in ((plain.support, redrawn.support), (plain.query, redrawn.query)):
+        np.testing.assert_array_equal(a.state, b.state)
+        np.testing.assert_array_equal(a.action, b.action)
+        changed = np.abs(a.image.astype(int) - b.image.astype(int)).max(axis=-1) > 2
+        # Three cubes of 0.06 m in an arena of 0.6 m cover 3% of it; the arm and the ground stay as they are.
+        assert 0.005 < changed.mean() < 0.06
+    # Support and query of a task show the same three new colours: the brightest red of the cubes agrees.
+    seen = [np.asarray(d.image, int) for d in (redrawn.support, redrawn.query)]
+    other = [np.asarray(d.image, int) for d in (plain.support, plain.query)]
+    for n in range(3):
+        new = [s[n][np.abs(s[n] - o[n]).max(axis=-1) > 2] for s, o in zip(seen, other, strict=True)]
+        np.testing.assert_allclose(new[0].max(axis=0), new[1].max(axis=0), atol=25)
+
+
 def test_batch_is_a_function_of_the_key(draw):
     first, again, other = draw(jax.random.key(3)), draw(jax.random.key(3)), draw(jax.random.key(4))
     jax.tree.map(np.testing.assert_array_equal, first, again)

@@ -138,6 +138,19 @@ def test_a_task_has_three_colours_and_any_cube_as_target(tasks):
         assert_uniform(np.bincount(drawn.target, minlength=3))
 
 
+def test_a_redrawn_task_keeps_its_target_and_has_other_training_colours(env, tasks):
+    keys = jax.random.split(jax.random.key(5), 4000)
+    redrawn = jax.jit(jax.vmap(env.redraw_appearance))(keys, tasks["train"])
+    np.testing.assert_array_equal(redrawn.target, tasks["train"].target)
+    colors = np.asarray(redrawn.object_color)
+    np.testing.assert_allclose(colors, np.round(colors, 1), atol=1e-6)  # the training grid is that of whole tenths
+    assert_uniform(np.bincount(np.round(colors * 10).astype(int).ravel(), minlength=10))
+    assert np.abs(colors[:, [0, 0, 1]] - colors[:, [1, 2, 2]]).max(axis=-1).min() > 0.09
+    # A cube keeps its colour with probability 1/1000.
+    kept = (np.abs(colors - tasks["train"].object_color).max(axis=-1) < 1e-6).sum()
+    assert kept < 12 + 4 * np.sqrt(12)
+
+
 def test_scenes_keep_their_distances_and_the_arm_starts_at_zero(env, task):
     draws = 20_000
     scenes = jax.jit(jax.vmap(env.reset, in_axes=(0, None)))(jax.random.split(jax.random.key(3), draws), task)
