@@ -180,7 +180,7 @@ class Config:
 
 def _reach_paper() -> Config:
     return Config(
-        network=NetworkConfig(fc_init_std=0.01),
+        network=NetworkConfig(fc_norm=False, fc_init_std=0.01),
         mil=MILConfig(loss_scale=100.0),
     )
 
@@ -204,8 +204,9 @@ def _reach_cpu() -> Config:
     config.network.filters = (32, 32, 32)
     config.network.fc_layers = (100, 100)
     config.train = TrainConfig(
-        steps=22_000, meta_batch=8, support_frames=3, query_frames=3, redraw_appearance=True, eval_every=4400
+        steps=14_000, meta_batch=8, support_frames=6, query_frames=6, redraw_appearance=True, eval_every=3500
     )
+    config.optimizer.learning_rate, config.optimizer.warmup = 2e-3, 0.02
     config.evaluation.validation_tasks = 25
     config.evaluation.baseline_trials = 1
     config.evaluation.batch = 25

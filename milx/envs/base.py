@@ -75,11 +75,12 @@ class Env(abc.ABC):
 
     def __init__(self, model: mujoco.MjModel, image_shape: tuple[int, int] | None = None):
         self.mj_model = model
-        self.model = mjx.put_model(model)
+        device = jax.local_devices()[0]  # MJX would take the first of all, which may be another host's
+        self.model = mjx.put_model(model, device)
         if image_shape is not None:
             self.image_shape = image_shape
         self.renderer = Renderer(model, self.camera, *self.image_shape)
-        self._data = mjx.make_data(self.model)
+        self._data = mjx.make_data(self.model, device)
 
     @property
     def action_size(self) -> int:

@@ -11,6 +11,7 @@ import pytest
 import milx
 from milx.envs import reach
 from milx.envs.base import State
+from milx.trajopt.linearize import linearize
 
 EPISODES = 4
 IMAGE_SHAPE = (48, 60)
@@ -95,6 +96,49 @@ def test_same_controls_give_the_trajectory_of_c_mujoco(env, actions, states):
         assert np.ptp(qpos) > 1, "the arm must move for the comparison to mean something"
         np.testing.assert_allclose(states.qpos[i], qpos, rtol=0, atol=1e-9)
         np.testing.assert_allclose(states.qvel[i], qvel, rtol=0, atol=1e-9)
+
+
+def test_jacobians_of_an_action_are_differences_of_c_mujoco(env, task, states):
+    """Central differences with steps of 1e-6 are off by about 1e-12 / 1e-6 from rounding, and less from curvature."""
+    states, _ = states
+    scene = env.reset(jax.random.key(4), task)
+    model, data = env.mj_model, mujoco.MjData(env.mj_model)
+
+    def advance(x, u):
+        mujoco.mj_resetData(model, data)
+        data.qpos[:], data.qvel[:], data.ctrl[:] = x[:2], x[2:], u
+        for _ in range(env.substeps):
+            mujoco.mj_step(model, data)
+        return np.concatenate([data.qpos, data.qvel])
+
+    jacobians = jax.jit(lambda x, u: linearize(lambda x, u: env.step(task, scene.with_vector(x), u).vector, x, u)[0])
+    x = np.asarray(jax.vmap(lambda s: s.vector)(jax.tree.map(lambda v: v[1, ::10], states)))
+    u = np.random.default_rng(3).uniform(-0.9, 0.9, (len(x), 2))
+    A, B = jacobians(x, u)
+    for i in range(len(x)):
+        z = np.concatenate([x[i], u[i]])
+        columns = [(advance(*np.split(z + e, [4])) - advance(*np.split(z - e, [4]))) / 2e-6 for e in 1e-6 * np.eye(6)]
+        np.testing.assert_allclose(np.concatenate([A[i], B[i]], axis=1), np.transpose(columns), atol=1e-7, rtol=1e-6)
+    assert np.abs(B).max() > 1e-3
+
+
+def test_float32_follows_c_mujoco_through_an_episode(env, task, actions, states):
+    """What ships: 1,000 Runge-Kutta steps round off to less than a tenth of a millimetre at the fingertip."""
+    exact, _ = states
+    with jax.enable_x64(False):
+        single = milx.make("reach", IMAGE_SHAPE)
+        start = jax.tree.map(lambda x: jnp.asarray(x[:, 0], jnp.float32), exact)
+        controls = jnp.asarray(actions, jnp.float32)
+
+        @jax.jit
+        @jax.vmap
+        def episode(state, actions):
+            last, _ = jax.lax.scan(lambda s, a: (single.step(None, s, a), None), state, actions)
+            return single.fingertip(last.qpos)
+
+        found = np.asarray(episode(start, controls))
+    expected = np.stack([env.fingertip(exact.qpos[i, -1]) for i in range(EPISODES)])
+    np.testing.assert_allclose(found, expected, atol=1e-4)
 
 
 def test_robot_state_is_that_of_c_mujoco(env, states):
