@@ -10,13 +10,18 @@ import statistics
 import sys
 
 
+def setting(result: dict) -> str:
+    """The preset, and what was changed in it."""
+    return f"{result['preset']} {result['variant']}".strip()
+
+
 def row(result: dict) -> str:
     """One result file as a line of the table."""
     low, high = result["wilson95"]
     floors = result["baselines"]
     cells = [
         result["method"],
-        " ".join(filter(None, [result["preset"], result["variant"]])),
+        setting(result),
         str(result["seed"]),
         f"{result['success']:.1%} ({low:.1%} to {high:.1%})",
         str(result["trials"]),
@@ -29,12 +34,19 @@ def row(result: dict) -> str:
 
 def mean(group: list[dict]) -> str:
     """The mean over the seeds of one setting as a line of the table."""
-    success = statistics.mean(result["success"] for result in group)
-    seconds = statistics.mean(result["wall_clock_s"]["total"] for result in group)
-    trials = sum(result["trials"] for result in group)
-    name = " ".join(filter(None, [group[0]["preset"], group[0]["variant"]]))
-    cells = [group[0]["method"], name, f"mean of {len(group)}", f"**{success:.1%}**", str(trials), "", "", ""]
-    return f"| {' | '.join([*cells, f'{seconds:.0f} s', ''])} |"
+    successes = [result["success"] for result in group]
+    floors = [statistics.mean(r["baselines"][name] for r in group) for name in ("random", "task_blind", "expert")]
+    cells = [
+        group[0]["method"],
+        setting(group[0]),
+        f"mean of {len(group)}",
+        f"**{statistics.mean(successes):.1%}** (seeds {min(successes):.1%} to {max(successes):.1%})",
+        str(sum(result["trials"] for result in group)),
+        *(f"{floor:.1%}" for floor in floors),
+        f"{statistics.mean(result['wall_clock_s']['total'] for result in group):.0f} s",
+        "",
+    ]
+    return f"| {' | '.join(cells)} |"
 
 
 def main(experiment: str) -> None:
