@@ -20,7 +20,6 @@ import jax
 import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-from tensorboardX import SummaryWriter
 
 from milx import config as config_lib
 from milx import envs, evaluator, methods, parallel, platform, provenance, report, whitening
@@ -30,6 +29,7 @@ from milx.data import demos as demos_lib
 from milx.data.demos import DemoSet
 from milx.envs.base import State
 from milx.methods.random import Random
+from milx.metrics import MetricsWriter
 from milx.policy import params_like, spec_of
 from milx.trainer import Trainer, TrainState, make_optimizer
 from milx.types import Params
@@ -64,8 +64,9 @@ class Run:
         console: where to report progress.
 
     Raises:
-        ValueError: if the folder holds a run of another configuration (the message shows the difference), the steps are
-            not whole numbers of scans, or the tasks of a meta-batch cannot be shared evenly by the devices.
+        ValueError: if the folder holds a run of another configuration (the message shows the difference), no
+            demonstration is left to be the query, the steps are not whole numbers of scans, or the tasks of a
+            meta-batch cannot be shared evenly by the devices.
     """
 
     def __init__(self, config: Config, workdir: str | pathlib.Path, console: Console | None = None):
@@ -299,32 +300,3 @@ def _write_json(path: pathlib.Path, values: dict[str, Any]) -> None:
     partial = path.with_suffix(".partial")
     partial.write_text(json.dumps(values, indent=1) + "\n")
     partial.replace(path)
-
-
-class MetricsWriter:
-    """Writes numbers to metrics.jsonl and to TensorBoard events.
-
-    Args:
-        folder: the run's.
-        step: where the run continues; lines after it are from before an interruption and are dropped.
-    """
-
-    def __init__(self, folder: pathlib.Path, step: int):
-        path = folder / "metrics.jsonl"
-        lines = [line for line in report.read_metrics(path) if line["step"] <= step] if path.is_file() else []
-        partial = path.with_suffix(".partial")
-        partial.write_text("".join(json.dumps(line) + "\n" for line in lines))
-        partial.replace(path)
-        self._file = path.open("a", buffering=1)
-        self._events = SummaryWriter(str(folder), purge_step=step + 1)
-
-    def write(self, step: int, values: dict[str, float]) -> None:
-        """Writes one line."""
-        self._file.write(json.dumps({"step": step, **values}) + "\n")
-        for name, value in values.items():
-            self._events.add_scalar(name, value, step)
-
-    def close(self) -> None:
-        """Flushes and closes both."""
-        self._file.close()
-        self._events.close()

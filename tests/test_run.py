@@ -14,8 +14,9 @@ import milx
 from milx import config as config_lib
 from milx.checkpoint import Checkpoints
 from milx.data import demos as demos_lib
+from milx.metrics import MetricsWriter
 from milx.policy import params_like, spec_of
-from milx.run import MetricsWriter, Run
+from milx.run import Run
 
 RESULT_FIELDS = {
     *("env", "method", "preset", "variant", "seed", "num_tasks_train", "num_demos_train", "shots", "given"),
