@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import mujoco
 from mujoco import mjx
 
-from milx.render.scene import Renderer, to_uint8
+from milx.render.scene import Renderer
 from milx.types import Observation
 
 Task = Any
@@ -91,7 +91,7 @@ class Env(abc.ABC):
     def action_range(self) -> tuple[jax.Array, jax.Array]:
         """The lowest and highest action, [A] each; `step` clips to it."""
         low, high = self.mj_model.actuator_ctrlrange.T
-        return jnp.asarray(low, jnp.float32), jnp.asarray(high, jnp.float32)
+        return jnp.asarray(low, float), jnp.asarray(high, float)
 
     @property
     @abc.abstractmethod
@@ -160,7 +160,7 @@ class Env(abc.ABC):
         data = mjx.kinematics(self.model, self.data(state))
         data = mjx.camlight(self.model, mjx.com_pos(self.model, data))
         scene = dataclasses.replace(self.renderer.scene(data), geom_rgba=self.colors(task))
-        return Observation(image=to_uint8(self.renderer.render(scene).color), state=self.robot_state(state))
+        return Observation(image=self.renderer.pixels(scene), state=self.robot_state(state))
 
 
 def check_split(split: str) -> None:

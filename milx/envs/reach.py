@@ -61,7 +61,7 @@ class Reach(Env):
         super().__init__(mujoco.MjModel.from_xml_path(str(ASSETS / "reach.xml")), image_shape)
         names = ["target", "distractor_0", "distractor_1"]
         self._object_geoms = np.array([self.mj_model.geom(name).id for name in names])
-        self._rgba = jnp.asarray(self.mj_model.geom_rgba, jnp.float32)
+        self._rgba = jnp.asarray(self.mj_model.geom_rgba, float)
         self._height = float(self.mj_model.body("target").pos[2])
         self._fingertip = self.mj_model.site("fingertip").id
 
@@ -141,5 +141,5 @@ class Reach(Env):
 def _draw_colors(key: jax.Array, split: str) -> jax.Array:
     """[3, 3] three different colours of the split's grid."""
     index = jax.random.choice(key, 1000, (NUM_OBJECTS,), replace=False)
-    grid = jnp.stack([index // 100, index // 10 % 10, index % 10], axis=-1).astype(jnp.float32)
+    grid = jnp.stack([index // 100, index // 10 % 10, index % 10], axis=-1).astype(float)
     return grid * 0.1 + COLOR_OFFSETS[split]

@@ -1,9 +1,10 @@
 """Layers whose weights may differ from task to task.
 
 After adaptation every task has its own kernels, and `vmap` over tasks turns `lax.conv` into a grouped convolution,
-which XLA runs badly everywhere. Written as strided slices and one matrix product, the same convolution becomes a
-batched matrix product.
+which XLA runs badly everywhere. Written as one matrix product, the same convolution becomes a batched matrix product.
 """
+
+import functools
 
 import flax.linen as nn
 import jax
@@ -16,31 +17,8 @@ def same_padding(size: int, kernel: int, stride: int) -> tuple[int, int]:
     return total // 2, total - total // 2
 
 
-def patches(x: jax.Array, kernel: int, stride: int) -> jax.Array:
-    """Every kernel-sized window of an image, SAME padding.
-
-    Args:
-        x: [B, H, W, C].
-        kernel: window height and width.
-        stride: step between windows.
-
-    Returns:
-        [B, ceil(H / stride), ceil(W / stride), kernel * kernel * C], ordered as a [kernel, kernel, C, F] kernel is.
-    """
-    height, width = x.shape[1:3]
-    pads = [same_padding(size, kernel, stride) for size in (height, width)]
-    x = jnp.pad(x, ((0, 0), *pads, (0, 0)))
-    rows, cols = -(-height // stride), -(-width // stride)
-    slices = [
-        x[:, i : i + (rows - 1) * stride + 1 : stride, j : j + (cols - 1) * stride + 1 : stride]
-        for i in range(kernel)
-        for j in range(kernel)
-    ]
-    return jnp.concatenate(slices, axis=-1)
-
-
 def conv2d(x: jax.Array, kernel: jax.Array, stride: int) -> jax.Array:
-    """Two-dimensional convolution with SAME padding, as slices and one matrix product.
+    """Two-dimensional convolution with SAME padding: on a CPU by patches, on accelerators by blocks.
 
     Args:
         x: [B, H, W, C].
@@ -50,7 +28,67 @@ def conv2d(x: jax.Array, kernel: jax.Array, stride: int) -> jax.Array:
     Returns:
         [B, ceil(H / stride), ceil(W / stride), F].
     """
-    return patches(x, kernel.shape[0], stride) @ kernel.reshape(-1, kernel.shape[-1])
+    by = convolve_patches if jax.default_backend() == "cpu" else convolve_blocks
+    return by(x, kernel, stride)
+
+
+def convolve_patches(x: jax.Array, kernel: jax.Array, stride: int) -> jax.Array:
+    """`conv2d` with the fewest multiplications: every window of the image is copied, then multiplied by the kernel."""
+    taps, _, _, filters = kernel.shape
+    height, width = x.shape[1:3]
+    x = jnp.pad(x, ((0, 0), *(same_padding(size, taps, stride) for size in (height, width)), (0, 0)))
+    rows, cols = ((-(-size // stride) - 1) * stride + 1 for size in (height, width))
+    patches = [x[:, i : i + rows : stride, j : j + cols : stride] for i in range(taps) for j in range(taps)]
+    return jnp.concatenate(patches, axis=-1) @ kernel.reshape(-1, filters)
+
+
+def convolve_blocks(x: jax.Array, kernel: jax.Array, stride: int) -> jax.Array:
+    """`conv2d` with little traffic to memory and large matrix products.
+
+    The image is cut into blocks just large enough that a tile of outputs depends on 2 x 2 neighbouring blocks, and the
+    kernel is spread over these four. Either the four are put side by side and multiplied at once, or each block is
+    multiplied by the weights of all four places and the products of neighbours are added: whichever moves less memory.
+    """
+    taps, _, channels, filters = kernel.shape
+    batch, *sizes, _ = x.shape
+    tile = max(1, -(-(taps - stride) // stride))
+    step = tile * stride
+    rows, cols = (-(-size // step) for size in sizes)
+
+    pads = []
+    for size, count in zip(sizes, (rows, cols), strict=True):
+        before, _ = same_padding(size, taps, stride)
+        pads.append((before, (count + 1) * step - size - before))
+    blocks = jnp.pad(x, ((0, 0), *pads, (0, 0))).reshape(batch, rows + 1, step, cols + 1, step, channels)
+    blocks = blocks.swapaxes(2, 3).reshape(batch, rows + 1, cols + 1, step * step * channels)
+
+    weights = _four_places(kernel, stride, tile)
+    places = [(i, j) for i in range(2) for j in range(2)]
+    if step * step * channels < tile * tile * filters:
+        neighbours = [blocks[:, i : i + rows, j : j + cols] for i, j in places]
+        y = jnp.concatenate(neighbours, axis=-1) @ weights.reshape(-1, tile * tile * filters)
+    else:
+        products = jnp.split(blocks @ jnp.concatenate(list(weights), axis=-1), len(places), axis=-1)
+        shifted = [z[:, i : i + rows, j : j + cols] for z, (i, j) in zip(products, places, strict=True)]
+        y = functools.reduce(jnp.add, shifted)
+
+    y = y.reshape(batch, rows, cols, tile, tile, filters).swapaxes(2, 3)
+    y = y.reshape(batch, rows * tile, cols * tile, filters)
+    return y[:, : -(-sizes[0] // stride), : -(-sizes[1] // stride)]
+
+
+def _four_places(kernel: jax.Array, stride: int, tile: int) -> jax.Array:
+    """What a block in each of 2 x 2 places adds to a tile of outputs: four maps [step * step * C, tile * tile * F]."""
+    taps, _, channels, filters = kernel.shape
+    step = tile * stride
+
+    def placed(i: int, j: int) -> jax.Array:
+        pads = [(at * stride, 2 * step - taps - at * stride) for at in (i, j)]
+        return jnp.pad(kernel, (*pads, (0, 0), (0, 0)))
+
+    maps = jnp.stack([placed(i, j) for i in range(tile) for j in range(tile)], axis=3)
+    maps = maps.reshape(2, step, 2, step, channels, tile * tile * filters).swapaxes(1, 2)
+    return maps.reshape(4, step * step * channels, tile * tile * filters)
 
 
 def spatial_soft_argmax(features: jax.Array, temperature: jax.Array) -> jax.Array:
@@ -73,8 +111,9 @@ def spatial_soft_argmax(features: jax.Array, temperature: jax.Array) -> jax.Arra
 def centred_layer_norm(x: jax.Array, bias: jax.Array) -> jax.Array:
     """Layer normalisation over all axes but the first, with a learned centre and no learned scale."""
     axes = tuple(range(1, x.ndim))
-    mean = x.mean(axes, keepdims=True)
-    variance = jnp.square(x - mean).mean(axes, keepdims=True)
+    # The variance as flax computes it, from sums that one pass over the input gives.
+    mean, square = x.mean(axes, keepdims=True), jnp.square(x).mean(axes, keepdims=True)
+    variance = jnp.maximum(square - jnp.square(mean), 0.0)
     return (x - mean) * jax.lax.rsqrt(variance + 1e-6) + bias
 
 

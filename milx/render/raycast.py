@@ -25,7 +25,6 @@ Vector = tuple[jax.Array, ...]
 
 # Divisors are kept this far from zero: a ray parallel to a face meets it very far away, and never at NaN.
 _TINY = 1e-12
-_INF_BITS = int(np.float32(np.inf).view(np.int32))
 
 
 class Kind(enum.IntEnum):
@@ -102,18 +101,23 @@ def unit_maps(
     return UnitMaps(jnp.matmul(to_unit, relative, precision=high), geom_size[:, 1] * inverse[:, 0])
 
 
-def _enter(kind: Kind, to_unit: UnitMaps, start: Vector | None, ray: Vector) -> jax.Array:
+def rows_of(affine: jax.Array) -> tuple[Vector, ...]:
+    """An affine map [3, 4] as three rows of four scalars."""
+    return tuple(tuple(row) for row in affine)
+
+
+def enter(kind: Kind, rows: tuple[Vector, ...], stretch: jax.Array, start: Vector | None, ray: Vector) -> jax.Array:
     """Distance at which rays enter one geom, infinite if they do not.
 
     Args:
         kind: of the geom.
-        to_unit: its map, without the leading axis.
+        rows: its map, three rows of four.
+        stretch: of its map.
         start: where the rays start, in the camera frame; None for the camera itself.
         ray: their directions in the camera frame.
     """
-    rows, offset = to_unit.affine[:, :3], to_unit.affine[:, 3]
-    o = tuple(offset) if start is None else tuple(offset[i] + dot(tuple(rows[i]), start) for i in range(3))
-    return _ENTER[kind](o, tuple(dot(tuple(row), ray) for row in rows), to_unit.stretch)
+    o = tuple(row[3] if start is None else row[3] + dot(row[:3], start) for row in rows)
+    return _ENTER[kind](o, tuple(dot(row[:3], ray) for row in rows), stretch)
 
 
 def _slab(o: jax.Array, d: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -195,7 +199,7 @@ def nearest(
 ) -> tuple[jax.Array, jax.Array]:
     """The geom that each ray from the camera enters first.
 
-    Bits of positive floats order as integers do. Distance and geom id therefore share one int32, the id in the lowest
+    Bits of positive floats order as integers do. Distance and geom id therefore share one integer, the id in the lowest
     bits, and the search is a running minimum.
 
     Args:
@@ -211,20 +215,23 @@ def nearest(
         (id [P] int32, -1 where nothing is hit; distance [P] m, infinite where nothing is hit). The bits lent to the id
         leave the distance short by less than one part in 2^22 / G: 6e-6 of it for 23 geoms.
     """
-    id_mask = (1 << (maps.affine.shape[0] - 1).bit_length()) - 1
-    best = jnp.full(rays[0].shape, _INF_BITS | id_mask, jnp.int32)
+    dtype = rays[0].dtype
+    bits_of = {jnp.dtype("float32"): jnp.int32, jnp.dtype("float64"): jnp.int64}[dtype]
+    infinite = np.array(np.inf, dtype).view(bits_of)
+    id_mask = bits_of((1 << (maps.affine.shape[0] - 1).bit_length()) - 1)
+    best = jnp.full(rays[0].shape, infinite | id_mask, bits_of)
     for kind, ids in groups.items():
 
         def closer(best, geom, kind=kind):
             to_unit, geom_id, shown = geom
-            t = _enter(kind, to_unit, None, rays)
-            bits = (jax.lax.bitcast_convert_type(t, jnp.int32) & ~id_mask) | geom_id
+            t = enter(kind, rows_of(to_unit.affine), to_unit.stretch, None, rays)
+            bits = (jax.lax.bitcast_convert_type(t, bits_of) & ~id_mask) | geom_id
             return jnp.where(shown & (t > near) & (t < far), jnp.minimum(best, bits), best), None
 
-        best, _ = jax.lax.scan(closer, best, (_select(maps, ids), jnp.asarray(ids, jnp.int32), visible[ids]))
-    hit = best < _INF_BITS
-    distance = jax.lax.bitcast_convert_type(best & ~id_mask, jnp.float32)
-    return jnp.where(hit, best & id_mask, -1), jnp.where(hit, distance, jnp.inf)
+        best, _ = jax.lax.scan(closer, best, (_select(maps, ids), jnp.asarray(ids, bits_of), visible[ids]))
+    hit = best < infinite
+    distance = jax.lax.bitcast_convert_type(best & ~id_mask, dtype)
+    return jnp.where(hit, best & id_mask, -1).astype(jnp.int32), jnp.where(hit, distance, jnp.inf)
 
 
 def blocked(
@@ -250,7 +257,7 @@ def blocked(
 
         def meets(found, geom, kind=kind):
             to_unit, shown = geom
-            t = _enter(kind, to_unit, start, ray)
+            t = enter(kind, rows_of(to_unit.affine), to_unit.stretch, start, ray)
             return found | (shown & (t > 0) & (t < reach)), None
 
         found, _ = jax.lax.scan(meets, found, (_select(maps, ids), visible[ids]))
@@ -270,10 +277,15 @@ def normals(groups: Mapping[Kind, np.ndarray], maps: UnitMaps, geom_id: jax.Arra
     for kind, ids in groups.items():
         kind_of_geom[ids] = kind
     entries = maps.affine.reshape(-1, 12)[geom_id]
-    rows = [tuple(entries[:, 4 * i + j] for j in range(3)) for i in range(3)]
-    local = tuple(entries[:, 4 * i + 3] + dot(rows[i], point) for i in range(3))
-    gradient = _gradient(jnp.asarray(kind_of_geom)[geom_id], maps.stretch[geom_id], local)
-    normal = tuple(dot(column, gradient) for column in zip(*rows, strict=True))
+    rows = tuple(tuple(entries[:, 4 * i + j] for j in range(4)) for i in range(3))
+    return surface_normal(jnp.asarray(kind_of_geom)[geom_id], rows, maps.stretch[geom_id], point)
+
+
+def surface_normal(kind: jax.Array, rows: tuple[Vector, ...], stretch: jax.Array, point: Vector) -> Vector:
+    """Unit normals where points lie on geoms of these kinds and maps, all of them arrays over the points."""
+    local = tuple(row[3] + dot(row[:3], point) for row in rows)
+    gradient = _gradient(kind, stretch, local)
+    normal = tuple(dot(column, gradient) for column in tuple(zip(*rows, strict=True))[:3])
     inverse = jax.lax.rsqrt(jnp.maximum(dot(normal, normal), _TINY))
     return tuple(inverse * component for component in normal)
 

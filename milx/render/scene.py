@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
-from milx.render import raycast, shade
+from milx.render import kernel, raycast, shade
 
 _DIRECTIONAL = int(mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
 _SPOT = int(mujoco.mjtLightType.mjLIGHT_SPOT)
@@ -93,11 +93,11 @@ class Renderer:
         self._shadows = shadows
         self._materials = _materials(model)
 
-        half_height = np.tan(np.deg2rad(model.cam_fovy[self._camera]) / 2)
-        x = (2 * (np.arange(width) + 0.5) / width - 1) * half_height * width / height
-        y = (1 - 2 * (np.arange(height) + 0.5) / height) * half_height
+        self._tangent = float(np.tan(np.deg2rad(model.cam_fovy[self._camera]) / 2))
+        x = (2 * (np.arange(width) + 0.5) / width - 1) * self._tangent * width / height
+        y = (1 - 2 * (np.arange(height) + 0.5) / height) * self._tangent
         x, y = np.meshgrid(x, y)
-        self._rays = (np.float32(x).ravel(), np.float32(y).ravel(), np.float32(-1))
+        self._rays = (x.ravel(), y.ravel(), np.array(-1.0))
 
     def scene(self, data: mjx.Data | mujoco.MjData) -> Scene:
         """The scene as the data has it: poses from the data; colours, sizes and lights from the model.
@@ -108,7 +108,7 @@ class Renderer:
         model = self._model
 
         def array(values, *shape: int) -> jax.Array:
-            return jnp.asarray(values, jnp.float32).reshape(shape)
+            return jnp.asarray(values, float).reshape(shape)
 
         # MJX keeps no light poses. Lights are fixed to their bodies, so they follow from those.
         body_xpos = array(data.xpos, -1, 3)[model.light_bodyid]
@@ -131,12 +131,9 @@ class Renderer:
 
     def render(self, scene: Scene) -> Frame:
         """The image of a scene."""
-        geometry = jax.lax.stop_gradient(
-            (scene.geom_xpos, scene.geom_xmat, scene.geom_size, scene.cam_xpos, scene.cam_xmat)
-        )
-        maps = raycast.unit_maps(self._model.geom_type, *geometry)
+        maps = raycast.unit_maps(self._model.geom_type, *_geometry(scene))
         visible = scene.geom_rgba[:, 3] > 0
-        rays = tuple(jnp.asarray(ray) for ray in self._rays)
+        rays = tuple(jnp.asarray(ray, scene.geom_xpos.dtype) for ray in self._rays)
         geom_id, distance = raycast.nearest(self._groups, maps, visible, rays, self._near, self._far)
         hit = geom_id >= 0
         # Where nothing is hit any finite point will do, but infinity would turn into NaN in the gradients.
@@ -144,7 +141,7 @@ class Renderer:
         winner = jnp.maximum(geom_id, 0)
         normal = raycast.normals(self._groups, maps, winner, point)
 
-        rgba, made_of = scene.geom_rgba[winner], jnp.asarray(self._materials)[winner]
+        rgba, made_of = scene.geom_rgba[winner], jnp.asarray(self._materials, float)[winner]
         material = shade.Material(tuple(rgba[:, i] for i in range(3)), *(made_of[:, i] for i in range(3)))
         color = shade.emitted(material)
         for casts, lights in self._lights(scene).items():
@@ -158,6 +155,24 @@ class Renderer:
             depth=distance.reshape(shape),
             geom_id=geom_id.reshape(shape),
         )
+
+    def pixels(self, scene: Scene) -> jax.Array:
+        """The image alone, [H, W, 3] uint8, without gradients; on a GPU in one kernel, unless there are shadows."""
+        if jax.default_backend() != "gpu" or self._shadows:
+            return to_uint8(self.render(scene).color)
+        return self.paint(scene)
+
+    def paint(self, scene: Scene, interpret: bool = False) -> jax.Array:
+        """`pixels` in one kernel of a GPU, without shadows; `interpret` runs it anywhere, slowly."""
+        geoms = kernel.geom_table(self._model.geom_type, _geometry(scene), scene.geom_rgba, self._materials)
+        order: list[int] = []
+        ranges = {}
+        for kind, ids in self._groups.items():
+            ranges[kind] = (len(order), len(order) + len(ids))
+            order += ids.tolist()
+        lights = kernel.light_table(self._lights(scene)[False])
+        view = kernel.View(self.height, self.width, self._tangent, self._near, self._far)
+        return kernel.paint(geoms[np.array(order)], lights, ranges, view, interpret)
 
     def _in_shadow(self, maps, visible, point, path, w) -> jax.Array:
         """Whether a geom stands between the points and a light: [P] bool."""
@@ -195,6 +210,11 @@ class Renderer:
         return {False: others, True: jax.tree.map(lambda a: a[active & casts], lights)}
 
 
+def _geometry(scene: Scene) -> tuple[jax.Array, ...]:
+    """Poses and sizes of the geoms, and the camera's pose, without gradients."""
+    return jax.lax.stop_gradient((scene.geom_xpos, scene.geom_xmat, scene.geom_size, scene.cam_xpos, scene.cam_xmat))
+
+
 def _rotate(matrix: jax.Array, vector: jax.Array) -> jax.Array:
     """Matrices [..., 3, 3] on vectors [..., 3], in full precision on every device."""
     return jnp.einsum("...ij,...j->...i", matrix, vector, precision=jax.lax.Precision.HIGHEST)
@@ -210,7 +230,7 @@ def _geom_rgba(model: mujoco.MjModel) -> np.ndarray:
 
 def _materials(model: mujoco.MjModel) -> np.ndarray:
     """[G, 3] emission, specular and shininess; without a material MuJoCo's defaults."""
-    values = np.tile(np.array([0.0, 0.5, 0.5], np.float32), (model.ngeom, 1))
+    values = np.tile([0.0, 0.5, 0.5], (model.ngeom, 1))
     has = model.geom_matid >= 0
     table = np.stack([model.mat_emission, model.mat_specular, model.mat_shininess], axis=1)
     values[has] = table[model.geom_matid[has]]

@@ -80,30 +80,41 @@ def reflected(
     Returns:
         Three [P] arrays, not clipped.
     """
-    to_eye, _ = _normalise(tuple(-x for x in point))
+    dark = tuple(jnp.zeros_like(channel) for channel in material.rgb)
 
     def add(color: Vector, light: Lights) -> tuple[Vector, None]:
-        w = light.position[3]
-        path = tuple(light.position[i] - w * point[i] for i in range(3))
-        to_light, distance = _normalise(path)
-        half, _ = _normalise(tuple(a + b for a, b in zip(to_light, to_eye, strict=True)))
+        more = reflect(light, material, point, normal, blocked)
+        return tuple(before + after for before, after in zip(color, more, strict=True)), None
 
-        facing = dot(normal, to_light)
-        diffuse = jnp.maximum(facing, 0.0)
-        shine = jnp.where(facing > 0, material.specular * _power(dot(normal, half), 128 * material.shininess), 0.0)
-        if blocked is not None:
-            lit = 1.0 - blocked(path, w)
-            diffuse, shine = lit * diffuse, lit * shine
-
-        constant, linear, quadratic = light.attenuation
-        strength = 1 / jnp.maximum(constant + distance * (linear + distance * quadratic), _SMALL)
-        cosine = -dot(tuple(light.direction), to_light)
-        strength = strength * jnp.where(cosine >= light.cutoff, _power(cosine, light.exponent), 0.0)
-        return tuple(
-            color[i]
-            + strength * (material.rgb[i] * (light.ambient[i] + light.diffuse[i] * diffuse) + light.specular[i] * shine)
-            for i in range(3)
-        ), None
-
-    dark = tuple(jnp.zeros_like(channel) for channel in material.rgb)
     return jax.lax.scan(add, dark, lights)[0]
+
+
+def reflect(
+    light: Lights,
+    material: Material,
+    point: Vector,
+    normal: Vector,
+    blocked: Callable[[Vector, jax.Array], jax.Array] | None = None,
+) -> Vector:
+    """Colour that one light adds; `light` has no leading axis. For the rest see `reflected`."""
+    w = light.position[3]
+    path = tuple(light.position[i] - w * point[i] for i in range(3))
+    to_light, distance = _normalise(path)
+    to_eye, _ = _normalise(tuple(-x for x in point))
+    half, _ = _normalise(tuple(a + b for a, b in zip(to_light, to_eye, strict=True)))
+
+    facing = dot(normal, to_light)
+    diffuse = jnp.maximum(facing, 0.0)
+    shine = jnp.where(facing > 0, material.specular * _power(dot(normal, half), 128 * material.shininess), 0.0)
+    if blocked is not None:
+        lit = 1.0 - blocked(path, w)
+        diffuse, shine = lit * diffuse, lit * shine
+
+    constant, linear, quadratic = light.attenuation
+    strength = 1 / jnp.maximum(constant + distance * (linear + distance * quadratic), _SMALL)
+    cosine = -dot(tuple(light.direction), to_light)
+    strength = strength * jnp.where(cosine >= light.cutoff, _power(cosine, light.exponent), 0.0)
+    return tuple(
+        strength * (material.rgb[i] * (light.ambient[i] + light.diffuse[i] * diffuse) + light.specular[i] * shine)
+        for i in range(3)
+    )

@@ -41,13 +41,14 @@ def derivatives(conv, inputs, directions, stride):
     return conv(*inputs, stride), gradient, product
 
 
-@pytest.mark.parametrize("shape", [(8, 10), (7, 9), (5, 8)])
-@pytest.mark.parametrize("kernel", [3, 5])
-@pytest.mark.parametrize("stride", [1, 2])
-def test_conv2d_and_its_derivatives_are_those_of_lax(rng, shape, kernel, stride):
+@pytest.mark.parametrize("convolve", [layers.convolve_patches, layers.convolve_blocks])
+@pytest.mark.parametrize("shape", [(8, 10), (7, 9)])
+@pytest.mark.parametrize("kernel", [1, 3, 5])
+@pytest.mark.parametrize("stride", [1, 2, 3])
+def test_convolution_and_its_derivatives_are_those_of_lax(rng, convolve, shape, kernel, stride):
     sizes = ((2, *shape, 3), (kernel, kernel, 3, 4))
     inputs, directions = (tuple(rng.standard_normal(size) for size in sizes) for _ in range(2))
-    found = derivatives(layers.conv2d, inputs, directions, stride)
+    found = derivatives(convolve, inputs, directions, stride)
     expected = derivatives(reference_conv2d, inputs, directions, stride)
     for name, ours, theirs in zip(["value", "gradient", "Hessian-vector product"], found, expected, strict=True):
         jax.tree.map(
@@ -59,9 +60,18 @@ def test_conv2d_and_its_derivatives_are_those_of_lax(rng, shape, kernel, stride)
         )
 
 
-def test_conv2d_with_every_tasks_own_kernel_is_a_loop_of_lax(rng):
+@pytest.mark.parametrize("filters", [2, 40])
+def test_blocks_that_are_put_side_by_side_or_added_give_the_same(rng, filters):
+    """With 3 channels and stride 2, blocks are put side by side for more than 12 filters, and added otherwise."""
+    x, kernel = rng.standard_normal((2, 9, 12, 3)), rng.standard_normal((3, 3, 3, filters))
+    found = layers.convolve_blocks(jnp.asarray(x), jnp.asarray(kernel), 2)
+    np.testing.assert_allclose(found, reference_conv2d(x, kernel, 2), atol=1e-12)
+
+
+@pytest.mark.parametrize("convolve", [layers.convolve_patches, layers.convolve_blocks])
+def test_convolution_with_every_tasks_own_kernel_is_a_loop_of_lax(rng, convolve):
     x, kernel = rng.standard_normal((5, 2, 8, 9, 3)), rng.standard_normal((5, 3, 3, 3, 4))
-    found = jax.vmap(lambda x, kernel: layers.conv2d(x, kernel, 2))(x, kernel)
+    found = jax.vmap(lambda x, kernel: convolve(x, kernel, 2))(x, kernel)
     expected = [reference_conv2d(x[i], kernel[i], 2) for i in range(5)]
     np.testing.assert_allclose(found, expected, atol=1e-12)
 

@@ -1,0 +1,157 @@
+"""The same image in one GPU kernel: rays, nearest hit and lighting of a tile of pixels, without leaving the registers.
+
+The arithmetic is that of `raycast` and `shade`, the readable reference; this file only arranges it for Pallas. A tile
+of pixels passes over every geom whose bounding ball lies outside the pyramid that the tile sees.
+"""
+
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jax.experimental import pallas as pl
+from jax.experimental.pallas import triton
+
+from milx.render import raycast, shade
+from milx.render.raycast import Kind
+
+_TILE = 16  # pixels, in both directions
+_WARPS = 4
+_SLACK = 1.001  # bounding balls are blown up by this, so that rounding never hides a geom
+
+# Columns of the table of geoms.
+_AFFINE, _STRETCH, _BALL, _KIND, _RGB, _MATERIAL = 0, 12, 13, 17, 18, 21
+# Columns of the table of lights: from and to of the vectors, then the two scalars.
+_LIGHT = ((0, 3), (3, 6), (6, 9), (9, 12), (12, 16), (16, 19))
+_CUTOFF, _EXPONENT = 19, 20
+
+
+class View(NamedTuple):
+    """What the camera sees: all static."""
+
+    height: int
+    width: int
+    tangent: float  # of half the vertical field of view
+    near: float  # m along the optical axis; nothing closer is seen
+    far: float  # m; nothing farther is seen
+
+
+def geom_table(
+    geom_type: np.ndarray, geometry: tuple[jax.Array, ...], rgba: jax.Array, materials: np.ndarray
+) -> jax.Array:
+    """[G, 24] all that the kernel knows of every geom.
+
+    Args:
+        geom_type: [G] static, MuJoCo's geom types.
+        geometry: the other arguments of `raycast.unit_maps`.
+        rgba: [G, 4] colours; where alpha is 0 the geom is passed over.
+        materials: [G, 3] emission, specular and shininess.
+    """
+    maps = raycast.unit_maps(geom_type, *geometry)
+    geom_xpos, _, geom_size, cam_xpos, cam_xmat = geometry
+    centre = jnp.matmul(geom_xpos - cam_xpos, cam_xmat, precision=jax.lax.Precision.HIGHEST)
+    radius = jnp.where(rgba[:, 3] > 0, bounding_radius(geom_type, geom_size), -jnp.inf)
+    kinds = np.array([raycast.KIND_OF_GEOM.get(int(kind), -1) for kind in geom_type])
+    columns = [maps.affine.reshape(-1, 12), maps.stretch, centre, radius, kinds, rgba[:, :3], materials]
+    return jnp.column_stack([jnp.asarray(column, jnp.float32) for column in columns])
+
+
+def bounding_radius(geom_type: np.ndarray, geom_size: jax.Array) -> jax.Array:
+    """[G] m, of a ball around the centre of every geom; infinite for a plane, which may be."""
+    geom = mujoco.mjtGeom
+    x, y, _ = geom_size.T
+    radius_of = {
+        geom.mjGEOM_SPHERE: x,
+        geom.mjGEOM_CAPSULE: x + y,
+        geom.mjGEOM_ELLIPSOID: geom_size.max(axis=1),
+        geom.mjGEOM_CYLINDER: jnp.hypot(x, y),
+        geom.mjGEOM_BOX: jnp.linalg.norm(geom_size, axis=1),
+    }
+    return jnp.select([geom_type == int(kind) for kind in radius_of], list(radius_of.values()), jnp.inf)
+
+
+def light_table(lights: shade.Lights) -> jax.Array:
+    """[L, 21] all lights, field by field."""
+    return jnp.column_stack(lights)
+
+
+def paint(
+    geoms: jax.Array, lights: jax.Array, ranges: dict[Kind, tuple[int, int]], view: View, interpret: bool = False
+) -> jax.Array:
+    """The image [H, W, 3] uint8 of a scene without shadows.
+
+    Args:
+        geoms: [G, 24] from `geom_table`, in any order that keeps each kind together.
+        lights: [L, 21] from `light_table`.
+        ranges: static, the first row of each kind and the row after its last.
+        view: what the camera sees.
+        interpret: run on any device, slowly, for tests.
+    """
+    return pl.pallas_call(
+        functools.partial(_paint_tile, ranges=ranges, view=view),
+        out_shape=jax.ShapeDtypeStruct((view.height, view.width, 3), jnp.uint8),
+        grid=(pl.cdiv(view.height, _TILE), pl.cdiv(view.width, _TILE)),
+        compiler_params=triton.CompilerParams(num_warps=_WARPS),
+        interpret=interpret,
+        name="paint",
+    )(geoms, lights)
+
+
+def _paint_tile(geoms, lights, image, *, ranges, view) -> None:
+    top, left = pl.program_id(0) * _TILE, pl.program_id(1) * _TILE
+
+    def ray(row, col):
+        x = (2 * (col + 0.5) / view.width - 1) * (view.tangent * view.width / view.height)
+        return x, (1 - 2 * (row + 0.5) / view.height) * view.tangent
+
+    pixel = jnp.arange(_TILE * _TILE)
+    row, col = top + pixel // _TILE, left + pixel % _TILE
+    rays = (*ray(row.astype(jnp.float32), col.astype(jnp.float32)), -1.0)
+    west, north = ray(top.astype(jnp.float32), left.astype(jnp.float32))
+    east, south = ray((top + _TILE - 1).astype(jnp.float32), (left + _TILE - 1).astype(jnp.float32))
+
+    def affine(geom):
+        return tuple(tuple(geoms[geom, _AFFINE + 4 * i + j] for j in range(4)) for i in range(3))
+
+    def in_sight(geom):
+        """Whether the geom's ball reaches into the tile's pyramid, whose sides all contain the camera."""
+        x, y, z, radius = (geoms[geom, _BALL + i] for i in range(4))
+        sides = [(x + west * z, west), (-x - east * z, east), (-y - north * z, north), (y + south * z, south)]
+        distances = [inside + _SLACK * radius * jnp.sqrt(1 + slope * slope) for inside, slope in sides]
+        return functools.reduce(jnp.minimum, distances) >= 0
+
+    best = (jnp.full(pixel.shape, jnp.inf, jnp.float32), jnp.zeros(pixel.shape, jnp.int32))
+    for kind, (first, last) in ranges.items():
+
+        def closer(geom, best, kind=kind):
+            def compare(best):
+                t = raycast.enter(kind, affine(geom), geoms[geom, _STRETCH], None, rays)
+                nearer = (t < best[0]) & (t > view.near) & (t < view.far)
+                return jnp.where(nearer, t, best[0]), jnp.where(nearer, geom, best[1])
+
+            return jax.lax.cond(in_sight(geom), compare, lambda best: best, best)
+
+        best = jax.lax.fori_loop(first, last, closer, best)
+
+    distance, winner = best
+    hit = distance < jnp.inf
+    point = tuple(jnp.where(hit, distance, 1.0) * x for x in rays)
+    normal = raycast.surface_normal(geoms[winner, _KIND], affine(winner), geoms[winner, _STRETCH], point)
+    rgb = tuple(geoms[winner, _RGB + i] for i in range(3))
+    material = shade.Material(rgb, *(geoms[winner, _MATERIAL + i] for i in range(3)))
+
+    def field(light, first: int, last: int) -> Any:
+        return tuple(lights[light, i] for i in range(first, last))
+
+    def add(light, color):
+        scalars = lights[light, _CUTOFF], lights[light, _EXPONENT]
+        one = shade.Lights._make([*(field(light, *span) for span in _LIGHT), *scalars])
+        return tuple(a + b for a, b in zip(color, shade.reflect(one, material, point, normal), strict=True))
+
+    color = jax.lax.fori_loop(0, lights.shape[0], add, shade.emitted(material))
+    inside = (row < view.height) & (col < view.width)
+    for i, channel in enumerate(color):
+        value = jnp.where(hit, 255 * jnp.clip(channel, 0.0, 1.0) + 0.5, 0.0).astype(jnp.uint8)
+        triton.store(image.at[row, col, i], value, mask=inside)
