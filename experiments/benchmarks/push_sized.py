@@ -13,7 +13,6 @@ import mujoco
 from mujoco import mjx
 
 from milx.config import Config, DataConfig, EnvConfig, MILConfig, NetworkConfig, TrainConfig
-from milx.data.demos import DemoSet
 from milx.envs.base import Env, State
 
 _JOINTS = ("0 0 1", "0 1 0", "0 0 1", "0 1 0", "1 0 0", "0 1 0", "1 0 0")
@@ -161,16 +160,3 @@ def config(**train: Any) -> Config:
         mil=MILConfig(inner_lr=0.01, inner_clip=10.0, loss_scale=50.0),
         train=TrainConfig(**{"meta_batch": 15, **train}),
     )
-
-
-def demos(env: Env, num_tasks: int, num_demos: int) -> DemoSet:
-    """Demonstrations of the right size: random poses, random actions."""
-    keys = jax.random.split(jax.random.key(0), 3)
-    tasks = jax.vmap(env.sample_task, in_axes=(0, None))(jax.random.split(keys[0], num_tasks), "train")
-
-    def one(key: jax.Array, task: Any) -> State:
-        return jax.vmap(env.reset, in_axes=(0, None))(jax.random.split(key, env.horizon + 1), task)
-
-    states = jax.vmap(jax.vmap(one, in_axes=(0, None)))(jax.random.split(keys[1], (num_tasks, num_demos)), tasks)
-    action = jax.random.uniform(keys[2], (num_tasks, num_demos, env.horizon, env.action_size), minval=-1)
-    return DemoSet(tasks, states, action, jnp.ones((num_tasks, num_demos), bool))

@@ -1,0 +1,67 @@
+"""What all benchmarks share: timing, and one JSON file of rows in experiments/results/benchmarks/."""
+
+import dataclasses
+import json
+import pathlib
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+
+from milx import provenance
+
+RESULTS = pathlib.Path(__file__).parents[1] / "results" / "benchmarks"
+
+
+def median_ms(
+    function: Callable[..., Any], *args: Any, repeats: int = 20, wait: Callable = jax.block_until_ready
+) -> float:
+    """Median time of a call in ms, after one call to warm up; `wait` blocks until a result is there."""
+    wait(function(*args))
+    times = []
+    for _ in range(repeats):
+        began = time.perf_counter()
+        wait(function(*args))
+        times.append(time.perf_counter() - began)
+    return 1e3 * statistics.median(times)
+
+
+def gib(compiled: jax.stages.Compiled) -> float:
+    """Memory that a compiled program needs beside its arguments and results."""
+    return compiled.memory_analysis().temp_size_in_bytes / 2**30
+
+
+@dataclasses.dataclass
+class Report:
+    """Rows of one benchmark, printed as they come and written as JSON after each, so that a crash loses none.
+
+    Attributes:
+        benchmark: the file's name.
+        folder: where it goes.
+    """
+
+    benchmark: str
+    folder: pathlib.Path
+    rows: list[dict[str, Any]] = dataclasses.field(default_factory=list)
+
+    def add(self, name: str, median: float | None, unit: str, memory: float | None = None, note: str = "") -> None:
+        """Adds a row; a median of None says that this was not run, and the note why."""
+        row = {"name": name, "median": median, "unit": unit, "peak_memory_gib": memory, "note": note}
+        self.rows.append(row)
+        value = "not run" if median is None else f"{median:,.4g} {unit}"
+        print(f"{self.benchmark:10s} {name:60s} {value:>20s} {note}", flush=True)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        content = {"benchmark": self.benchmark, **provenance.describe(), "rows": self.rows}
+        (self.folder / f"{self.benchmark}.json").write_text(json.dumps(content, indent=1) + "\n")
+
+    def attempt(self, name: str, unit: str, measure: Callable[[], tuple[float, float | None]], note: str = "") -> None:
+        """Adds what `measure` returns, (median, memory); if it cannot run here, says so instead."""
+        try:
+            median, memory = measure()
+        except Exception as error:  # whatever keeps a peer from running is the finding
+            text = str(error).strip().splitlines()
+            self.add(name, None, unit, note=f"not run: {type(error).__name__}: {text[0][:150] if text else ''}")
+        else:
+            self.add(name, median, unit, memory, note)

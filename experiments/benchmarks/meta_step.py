@@ -1,0 +1,168 @@
+"""Times a meta-gradient of the paper's sizes, push and reach, in milx and in what a user would write instead.
+
+    python experiments/benchmarks/meta_step.py --out=experiments/results/benchmarks
+
+All work on the same random images. Peers: vmap over `lax.conv`, PyTorch (if it is installed) with a loop over tasks,
+with torch.func and with torch.compile. A roofline says how far from the hardware's limit that is.
+"""
+
+import os
+
+os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # PyTorch needs memory in the same process
+
+import dataclasses
+import pathlib
+from typing import Any
+
+import common
+import jax
+import jax.numpy as jnp
+import push_sized
+import workload
+from absl import app, flags
+
+from milx import envs, methods, platform
+from milx.config import Config, make_config
+from milx.envs.base import Env
+from milx.networks import layers
+from milx.policy import spec_of
+from milx.trainer import Trainer, make_optimizer
+from milx.types import TaskBatch
+
+_OUT = flags.DEFINE_string("out", str(common.RESULTS), "Folder of the JSON file.")
+_TASKS = flags.DEFINE_integer("tasks", None, "Tasks in a meta-batch; the paper's by default.")
+_FRAMES = flags.DEFINE_integer("frames", None, "Time steps of a demonstration; all by default.")
+_DOMAINS = flags.DEFINE_list("domains", ["reach", "push"], "Which sizes.")
+
+
+def domain(name: str) -> tuple[Config, Env]:
+    """Configuration and environment of the paper's experiment."""
+    if name == "push":
+        return push_sized.config(), push_sized.PushSized()
+    return make_config("reach", preset="paper"), envs.make("reach")
+
+
+def compile_gradient(config: Config, env: Env, batch: TaskBatch) -> tuple[jax.stages.Compiled, Any]:
+    """The meta-gradient of milx, compiled, and parameters for it."""
+    method = methods.make(config, spec_of(env))
+    params = method.init(jax.random.key(0), workload.unit_whitening(env))
+    gradient = jax.jit(jax.grad(lambda params, batch: method.loss(params, batch)[0]))
+    return gradient.lower(params, batch).compile(platform.pixel_options()), params
+
+
+def lax_convolution(x: jax.Array, kernel: jax.Array, stride: int) -> jax.Array:
+    """What one writes first."""
+    numbers = ("NHWC", "HWIO", "NHWC")
+    return jax.lax.conv_general_dilated(x, kernel, (stride, stride), "SAME", dimension_numbers=numbers)
+
+
+def floor_ms(config: Config, env: Env, tasks: int, frames: int) -> tuple[float, str]:
+    """The least time of a meta-gradient: operations and bytes over ceilings that are measured here.
+
+    Convolutions in bfloat16, fully connected layers left out. A forward pass counts 1, a backward pass 2 (1 for the
+    first layer, which needs no gradient of the image); the support demonstration takes one of each, and twice that
+    again for the Hessian-vector product; the query one of each. Every pass reads its inputs and writes its outputs.
+    """
+    n = 8192
+    a = jax.random.normal(jax.random.key(0), (n, n), jnp.bfloat16)
+    product = jax.jit(lambda a: a @ a)
+    operations_per_s = 2 * n**3 / (1e-3 * common.median_ms(product, a, repeats=10))
+    copied = jnp.zeros((2**30,), jnp.int8)
+    bytes_per_s = 2 * copied.size / (1e-3 * common.median_ms(jax.jit(lambda x: x + 1), copied, repeats=10))
+
+    operations = traffic = 0.0
+    (height, width), channels = env.image_shape, 3
+    for i, (filters, stride) in enumerate(zip(config.network.filters, config.network.strides, strict=True)):
+        inputs = height * width * channels
+        height, width = -(-height // stride), -(-width // stride)
+        outputs = height * width * filters
+        products = 2 * outputs * channels * config.network.kernel**2
+        passes = (1 + (2 if i else 1)) * (1 + 2 + 1)
+        operations += passes * products
+        traffic += passes * (2 if i else 1) * inputs + passes * 2 * outputs
+        channels = filters
+    count = tasks * frames
+    by_operations, by_bytes = 1e3 * count * operations / operations_per_s, 1e3 * count * traffic / bytes_per_s
+    note = (
+        f"{count * operations / 1e9:.0f} GFLOP at {operations_per_s / 1e12:.0f} TFLOP/s: {by_operations:.2f} ms; "
+        f"{count * traffic / 1e9:.1f} GB at {bytes_per_s / 1e12:.2f} TB/s: {by_bytes:.2f} ms"
+    )
+    return max(by_operations, by_bytes), note
+
+
+def measure_torch(config: Config, env: Env, batch: TaskBatch, mode: str, bf16: bool) -> tuple[float, float]:
+    """Median ms and peak GiB of the PyTorch peer."""
+    import torch
+    import torch_peer
+
+    if not torch.cuda.is_available():
+        raise RuntimeError("PyTorch sees no GPU")
+
+    def tensor(get) -> Any:
+        both = jnp.stack([get(batch.support)[:, 0], get(batch.query)[:, 0]], axis=1)
+        return torch.utils.dlpack.from_dlpack(both)
+
+    data = [tensor(lambda demo: demo.image), tensor(lambda demo: demo.state), tensor(lambda demo: demo.action)]
+    torch.manual_seed(0)
+    params = torch_peer.make_params(config, env.image_shape, env.state_size, env.action_size)
+    step = torch_peer.make_step(config, mode, bf16)
+    torch.cuda.reset_peak_memory_stats()
+    for _ in range(3):
+        step(params, *data)
+    milliseconds = common.median_ms(step, params, *data, wait=lambda _: torch.cuda.synchronize())
+    memory = torch.cuda.max_memory_allocated() / 2**30
+    torch.cuda.empty_cache()
+    return milliseconds, memory
+
+
+def measure_domain(name: str, report: common.Report) -> None:
+    """Adds all rows of one experiment's sizes."""
+    config, env = domain(name)
+    tasks, frames = _TASKS.value or config.train.meta_batch, _FRAMES.value or env.horizon
+    config.train.meta_batch, config.train.support_frames, config.train.query_frames = tasks, frames, frames
+    batch = workload.random_batch(env, tasks, frames)
+    sizes = f"{tasks} tasks x 2 x {frames} frames of {env.image_shape[1]}x{env.image_shape[0]}"
+    repeats = 20 if jax.default_backend() != "cpu" else 3
+
+    def gradient(mixed: bool) -> tuple[float, float]:
+        changed = dataclasses.replace(config, network=dataclasses.replace(config.network, mixed_precision=mixed))
+        compiled, params = compile_gradient(changed, env, batch)
+        return common.median_ms(compiled, params, batch, repeats=repeats), common.gib(compiled)
+
+    def whole_step(mixed: bool) -> tuple[float, float]:
+        changed = dataclasses.replace(config, network=dataclasses.replace(config.network, mixed_precision=mixed))
+        trainer = Trainer(env, methods.make(changed, spec_of(env)), config.train, make_optimizer(config.optimizer, 100))
+        state, demos = trainer.init(jax.random.key(0), workload.unit_whitening(env)), workload.random_demos(env, 32, 4)
+        steps = 20 if jax.default_backend() != "cpu" else 2
+        compiled = Trainer.run.lower(trainer, state, demos, jax.random.key(1), steps).compile(platform.pixel_options())
+        return common.median_ms(compiled, state, demos, jax.random.key(1), repeats=5) / steps, common.gib(compiled)
+
+    accelerated = jax.default_backend() != "cpu"
+    for mixed in (True, False) if accelerated else (False,):
+        kind = "bfloat16" if mixed else "float32"
+        report.attempt(f"{name}: milx, {kind}", "ms", lambda mixed=mixed: gradient(mixed), sizes)
+        report.attempt(f"{name}: milx, {kind}, whole step with rendering", "ms", lambda mixed=mixed: whole_step(mixed))
+    ours, layers.conv2d = layers.conv2d, lax_convolution
+    for mixed in (True, False) if accelerated else (False,):
+        kind = "bfloat16" if mixed else "float32"
+        report.attempt(f"{name}: JAX, vmap over lax.conv, {kind}", "ms", lambda mixed=mixed: gradient(mixed))
+    layers.conv2d = ours
+    for mode, bf16 in (("loop", False), ("vmap", False), ("vmap", True), ("compile", False), ("compile", True)):
+        kind = "bfloat16" if bf16 else "float32"
+        report.attempt(
+            f"{name}: PyTorch, {mode}, {kind}", "ms", lambda m=mode, b=bf16: measure_torch(config, env, batch, m, b)
+        )
+    if accelerated:
+        least, note = floor_ms(config, env, tasks, frames)
+        report.add(f"{name}: roofline", least, "ms", note=note)
+
+
+def main(_: list[str]) -> None:
+    """Measures and writes the JSON file."""
+    report = common.Report("meta_step", pathlib.Path(_OUT.value))
+    for name in _DOMAINS.value:
+        measure_domain(name, report)
+
+
+if __name__ == "__main__":
+    app.run(main)

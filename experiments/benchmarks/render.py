@@ -1,0 +1,128 @@
+"""Times images of the push-sized scene and of reach, in milx, in MJX-Warp and in MuJoCo's own renderer.
+
+    python experiments/benchmarks/render.py
+
+From poses (after forward kinematics) to RGB, without shadows. MJX-Warp needs the package warp-lang and a GPU.
+"""
+
+import os
+
+os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # Warp needs memory in the same process
+os.environ.setdefault("MUJOCO_GL", "egl")
+
+import multiprocessing
+import pathlib
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+
+import common
+import jax
+import jax.numpy as jnp
+import mujoco
+import push_sized
+from absl import app, flags
+from mujoco import mjx
+
+from milx import envs, platform
+from milx.envs.base import Env
+from milx.render.scene import Scene, to_uint8
+
+_OUT = flags.DEFINE_string("out", str(common.RESULTS), "Folder of the JSON file.")
+_FRAMES = flags.DEFINE_integer("frames", None, "Frames at once; 4,096 on an accelerator and 64 on a CPU by default.")
+
+
+def random_scenes(env: Env, count: int) -> Scene:
+    """Scenes of random states after forward kinematics, with a leading axis."""
+    task = env.sample_task(jax.random.key(0), "train")
+
+    def scene(key: jax.Array) -> Scene:
+        data = mjx.kinematics(env.model, env.data(env.reset(key, task)))
+        return env.renderer.scene(mjx.camlight(env.model, mjx.com_pos(env.model, data)))
+
+    return jax.jit(jax.vmap(scene))(jax.random.split(jax.random.key(1), count))
+
+
+def measure_warp(env: Env, count: int) -> tuple[float, None]:
+    """Frames/s of MJX-Warp's batch renderer, which builds its bounding volumes anew for new poses."""
+    import warp  # noqa: F401  without it MJX fails later and says less
+
+    model = env.mj_model
+    mx = mjx.put_model(model, impl="warp")
+    task = env.sample_task(jax.random.key(0), "train")
+
+    def pose(key: jax.Array) -> mjx.Data:
+        state = env.reset(key, task)
+        data = mjx.make_data(model, impl="warp", naconmax=8 * count, njmax=64)
+        return data.replace(qpos=state.qpos, mocap_pos=state.mocap_pos)
+
+    data = jax.jit(jax.vmap(pose))(jax.random.split(jax.random.key(1), count))
+    data = jax.jit(jax.vmap(mjx.forward, in_axes=(None, 0)))(mx, data)
+    height, width = env.image_shape
+    context = mjx.create_render_context(
+        mjm=model,
+        nworld=count,
+        cam_res=(width, height),
+        use_textures=False,
+        use_shadows=False,
+        render_rgb=True,
+        render_depth=False,
+        enabled_geom_groups=[0, 1, 2],
+    )
+
+    def render(mx: mjx.Model, data: mjx.Data) -> jax.Array:
+        data = mjx.refit_bvh(mx, data, context.pytree())
+        return mjx.render(mx, data, context.pytree())[0]
+
+    compiled = jax.jit(render, compiler_options={"xla_gpu_graph_min_graph_size": 1})
+    image = compiled(mx, data)
+    if not jnp.any(image != image.ravel()[0]):
+        raise RuntimeError("the image has one colour only")
+    return 1e3 * count / common.median_ms(compiled, mx, data), None
+
+
+def measure_opengl(model: mujoco.MjModel, camera: str, image_shape: tuple[int, int]) -> float:
+    """Frames/s of `mujoco.Renderer`."""
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    with mujoco.Renderer(model, *image_shape) as renderer:
+        renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
+
+        def render() -> object:
+            renderer.update_scene(data, camera=camera)
+            return renderer.render()
+
+        return 1e3 / common.median_ms(render)
+
+
+def measure_opengl_elsewhere(env: Env) -> tuple[float, None]:
+    """The same in another process: without a display, OpenGL may abort."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        return pool.submit(measure_opengl, env.mj_model, env.camera, env.image_shape).result(), None
+
+
+def measure_milx(env: Env, count: int, draw: Callable[[Scene], jax.Array]) -> tuple[float, float]:
+    """Frames/s and GiB of a function from a scene to pixels."""
+    scenes = random_scenes(env, count)
+    compiled = jax.jit(jax.vmap(draw)).lower(scenes).compile(platform.pixel_options())
+    return 1e3 * count / common.median_ms(compiled, scenes), common.gib(compiled)
+
+
+def main(_: list[str]) -> None:
+    """Measures and writes the JSON file."""
+    report = common.Report("render", pathlib.Path(_OUT.value))
+    count = _FRAMES.value or (64 if jax.default_backend() == "cpu" else 4096)
+    note = f"{count} at once"
+    for env in (push_sized.PushSized(), envs.make("reach")):
+        height, width = env.image_shape
+        name = f"{env.name}, {env.mj_model.ngeom} geoms, {width}x{height}"
+        draw = env.renderer.pixels
+        report.attempt(f"{name}: milx", "frames/s", lambda e=env, d=draw: measure_milx(e, count, d), note)
+        if jax.default_backend() != "cpu":
+            draw = lambda scene, r=env.renderer: to_uint8(r.render(scene).color)  # noqa: E731
+            report.attempt(f"{name}: milx, XLA", "frames/s", lambda e=env, d=draw: measure_milx(e, count, d), note)
+        report.attempt(f"{name}: MJX-Warp", "frames/s", lambda e=env: measure_warp(e, count), note)
+        report.attempt(f"{name}: mujoco.Renderer", "frames/s", lambda e=env: measure_opengl_elsewhere(e), "one by one")
+
+
+if __name__ == "__main__":
+    app.run(main)
