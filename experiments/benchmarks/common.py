@@ -13,6 +13,7 @@ import jax
 from milx import provenance
 
 RESULTS = pathlib.Path(__file__).parents[1] / "results" / "benchmarks"
+ACCELERATED = jax.default_backend() != "cpu"
 
 
 def median_ms(
@@ -38,7 +39,7 @@ class Report:
     """Rows of one benchmark, printed as they come and written as JSON after each, so that a crash loses none.
 
     Attributes:
-        benchmark: the file's name.
+        benchmark: the file's name, but for "-cpu" where there is no accelerator.
         folder: where it goes.
     """
 
@@ -54,7 +55,8 @@ class Report:
         print(f"{self.benchmark:10s} {name:60s} {value:>20s} {note}", flush=True)
         self.folder.mkdir(parents=True, exist_ok=True)
         content = {"benchmark": self.benchmark, **provenance.describe(), "rows": self.rows}
-        (self.folder / f"{self.benchmark}.json").write_text(json.dumps(content, indent=1) + "\n")
+        name = self.benchmark if ACCELERATED else f"{self.benchmark}-cpu"
+        (self.folder / f"{name}.json").write_text(json.dumps(content, indent=1) + "\n")
 
     def attempt(self, name: str, unit: str, measure: Callable[[], tuple[float, float | None]], note: str = "") -> None:
         """Adds what `measure` returns, (median, memory); if it cannot run here, says so instead."""

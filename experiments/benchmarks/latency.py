@@ -56,7 +56,7 @@ def measure_evaluation(config: Config, env: Env, report: common.Report) -> None:
 
 def measure_planning(env: Env, report: common.Report) -> None:
     """Row of demonstrations planned and performed."""
-    count = _PLANS.value or (50 if jax.default_backend() == "cpu" else 4096)
+    count = _PLANS.value or (50 if not common.ACCELERATED else 4096)
     keys = jax.random.split(jax.random.key(0), count)
     task = jax.vmap(env.sample_task, in_axes=(0, None))(keys, "train")
     state = jax.vmap(env.reset)(keys, task)

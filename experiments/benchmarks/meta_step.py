@@ -115,14 +115,15 @@ def measure_torch(config: Config, env: Env, batch: TaskBatch, mode: str, bf16: b
     return milliseconds, memory
 
 
-def measure_domain(name: str, report: common.Report) -> None:
-    """Adds all rows of one experiment's sizes."""
+def measure_domain(name: str) -> None:
+    """Writes all rows of one experiment's sizes."""
+    report = common.Report(f"meta_step-{name}", pathlib.Path(_OUT.value))
     config, env = domain(name)
     tasks, frames = _TASKS.value or config.train.meta_batch, _FRAMES.value or env.horizon
     config.train.meta_batch, config.train.support_frames, config.train.query_frames = tasks, frames, frames
     batch = workload.random_batch(env, tasks, frames)
     sizes = f"{tasks} tasks x 2 x {frames} frames of {env.image_shape[1]}x{env.image_shape[0]}"
-    repeats = 20 if jax.default_backend() != "cpu" else 3
+    repeats = 20 if common.ACCELERATED else 3
 
     def gradient(mixed: bool) -> tuple[float, float]:
         changed = dataclasses.replace(config, network=dataclasses.replace(config.network, mixed_precision=mixed))
@@ -133,35 +134,32 @@ def measure_domain(name: str, report: common.Report) -> None:
         changed = dataclasses.replace(config, network=dataclasses.replace(config.network, mixed_precision=mixed))
         trainer = Trainer(env, methods.make(changed, spec_of(env)), config.train, make_optimizer(config.optimizer, 100))
         state, demos = trainer.init(jax.random.key(0), workload.unit_whitening(env)), workload.random_demos(env, 32, 4)
-        steps = 20 if jax.default_backend() != "cpu" else 2
+        steps = 20 if common.ACCELERATED else 2
         compiled = Trainer.run.lower(trainer, state, demos, jax.random.key(1), steps).compile(platform.pixel_options())
         return common.median_ms(compiled, state, demos, jax.random.key(1), repeats=5) / steps, common.gib(compiled)
 
-    accelerated = jax.default_backend() != "cpu"
+    accelerated = common.ACCELERATED
     for mixed in (True, False) if accelerated else (False,):
         kind = "bfloat16" if mixed else "float32"
-        report.attempt(f"{name}: milx, {kind}", "ms", lambda mixed=mixed: gradient(mixed), sizes)
-        report.attempt(f"{name}: milx, {kind}, whole step with rendering", "ms", lambda mixed=mixed: whole_step(mixed))
+        report.attempt(f"milx, {kind}", "ms", lambda mixed=mixed: gradient(mixed), sizes)
+        report.attempt(f"milx, {kind}, whole step with rendering", "ms", lambda mixed=mixed: whole_step(mixed))
     ours, layers.conv2d = layers.conv2d, lax_convolution
     for mixed in (True, False) if accelerated else (False,):
         kind = "bfloat16" if mixed else "float32"
-        report.attempt(f"{name}: JAX, vmap over lax.conv, {kind}", "ms", lambda mixed=mixed: gradient(mixed))
+        report.attempt(f"JAX, vmap over lax.conv, {kind}", "ms", lambda mixed=mixed: gradient(mixed))
     layers.conv2d = ours
     for mode, bf16 in (("loop", False), ("vmap", False), ("vmap", True), ("compile", False), ("compile", True)):
         kind = "bfloat16" if bf16 else "float32"
-        report.attempt(
-            f"{name}: PyTorch, {mode}, {kind}", "ms", lambda m=mode, b=bf16: measure_torch(config, env, batch, m, b)
-        )
+        report.attempt(f"PyTorch, {mode}, {kind}", "ms", lambda m=mode, b=bf16: measure_torch(config, env, batch, m, b))
     if accelerated:
         least, note = floor_ms(config, env, tasks, frames)
-        report.add(f"{name}: roofline", least, "ms", note=note)
+        report.add("roofline", least, "ms", note=note)
 
 
 def main(_: list[str]) -> None:
-    """Measures and writes the JSON file."""
-    report = common.Report("meta_step", pathlib.Path(_OUT.value))
+    """Measures and writes the JSON files."""
     for name in _DOMAINS.value:
-        measure_domain(name, report)
+        measure_domain(name)
 
 
 if __name__ == "__main__":

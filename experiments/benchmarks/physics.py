@@ -93,7 +93,7 @@ def measure_jacobians(env: push_sized.PushSized, points: int, how: str) -> tuple
 def main(_: list[str]) -> None:
     """Measures and writes the JSON file."""
     report, env = common.Report("physics", pathlib.Path(_OUT.value)), push_sized.PushSized()
-    accelerated = jax.default_backend() != "cpu"
+    accelerated = common.ACCELERATED
     worlds = _WORLDS.value or (8192 if accelerated else 64)
     points = _POINTS.value or (2048 if accelerated else 32)
     note, unit = f"{worlds} worlds, nv = {env.mj_model.nv}, contacts", "substeps/s"

@@ -8,7 +8,6 @@ From poses (after forward kinematics) to RGB, without shadows. MJX-Warp needs th
 import os
 
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # Warp needs memory in the same process
-os.environ.setdefault("MUJOCO_GL", "egl")
 
 import multiprocessing
 import pathlib
@@ -96,6 +95,7 @@ def measure_opengl(model: mujoco.MjModel, camera: str, image_shape: tuple[int, i
 
 def measure_opengl_elsewhere(env: Env) -> tuple[float, None]:
     """The same in another process: without a display, OpenGL may abort."""
+    os.environ.setdefault("MUJOCO_GL", "egl")  # for the other process only: where EGL is missing, MuJoCo does not load
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
         return pool.submit(measure_opengl, env.mj_model, env.camera, env.image_shape).result(), None
 
@@ -110,14 +110,14 @@ def measure_milx(env: Env, count: int, draw: Callable[[Scene], jax.Array]) -> tu
 def main(_: list[str]) -> None:
     """Measures and writes the JSON file."""
     report = common.Report("render", pathlib.Path(_OUT.value))
-    count = _FRAMES.value or (64 if jax.default_backend() == "cpu" else 4096)
+    count = _FRAMES.value or (64 if not common.ACCELERATED else 4096)
     note = f"{count} at once"
     for env in (push_sized.PushSized(), envs.make("reach")):
         height, width = env.image_shape
         name = f"{env.name}, {env.mj_model.ngeom} geoms, {width}x{height}"
         draw = env.renderer.pixels
         report.attempt(f"{name}: milx", "frames/s", lambda e=env, d=draw: measure_milx(e, count, d), note)
-        if jax.default_backend() != "cpu":
+        if common.ACCELERATED:
             draw = lambda scene, r=env.renderer: to_uint8(r.render(scene).color)  # noqa: E731
             report.attempt(f"{name}: milx, XLA", "frames/s", lambda e=env, d=draw: measure_milx(e, count, d), note)
         report.attempt(f"{name}: MJX-Warp", "frames/s", lambda e=env: measure_warp(e, count), note)
