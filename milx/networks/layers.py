@@ -38,8 +38,11 @@ def convolve_patches(x: jax.Array, kernel: jax.Array, stride: int) -> jax.Array:
     height, width = x.shape[1:3]
     x = jnp.pad(x, ((0, 0), *(same_padding(size, taps, stride) for size in (height, width)), (0, 0)))
     rows, cols = ((-(-size // stride) - 1) * stride + 1 for size in (height, width))
-    patches = [x[:, i : i + rows : stride, j : j + cols : stride] for i in range(taps) for j in range(taps)]
-    return jnp.concatenate(patches, axis=-1) @ kernel.reshape(-1, filters)
+    shifted = [x[:, i : i + rows : stride, j : j + cols : stride] for i in range(taps) for j in range(taps)]
+    patches = jnp.concatenate(shifted, axis=-1)
+    # As a plain matrix: with four axes XLA copies the output's gradient into another order, slowly.
+    y = patches.reshape(-1, patches.shape[-1]) @ kernel.reshape(-1, filters)
+    return y.reshape(*patches.shape[:3], filters)
 
 
 def convolve_blocks(x: jax.Array, kernel: jax.Array, stride: int) -> jax.Array:
