@@ -1,0 +1,57 @@
+"""How a meta-step's time and memory grow: with the meta-batch, the horizon, the image and the inner steps.
+
+    python experiments/benchmarks/growth.py
+
+The paper's reach network, rendering included; one size changes at a time.
+"""
+
+import pathlib
+
+import common
+import jax
+import workload
+from absl import app, flags
+
+from milx import envs, methods, platform
+from milx.config import Config, make_config
+from milx.policy import spec_of
+from milx.trainer import Trainer, make_optimizer
+
+_OUT = flags.DEFINE_string("out", str(common.RESULTS), "Folder of the JSON file.")
+_TINY = flags.DEFINE_bool("tiny", False, "Two sizes of each, for a try.")
+_SIZES = {
+    "meta-batch": (5, 15, 40, 100),
+    "time steps": (10, 25, 50),
+    "image rows": (32, 64, 128),
+    "inner steps": (1, 3, 5),
+}
+
+
+def measure(config: Config) -> tuple[float, float]:
+    """Median ms of a step in a scan, and GiB."""
+    env = envs.make("reach", config.env.image_shape)
+    trainer = Trainer(env, methods.make(config, spec_of(env)), config.train, make_optimizer(config.optimizer, 100))
+    state = trainer.init(jax.random.key(0), workload.unit_whitening(env))
+    demos, key, steps = workload.random_demos(env, 32, 4), jax.random.key(1), 20 if common.ACCELERATED else 1
+    compiled = Trainer.run.lower(trainer, state, demos, key, steps).compile(platform.pixel_options())
+    return common.median_ms(compiled, state, demos, key, repeats=3) / steps, common.gib(compiled)
+
+
+def main(_: list[str]) -> None:
+    """Measures and writes the JSON file."""
+    report = common.Report("growth", pathlib.Path(_OUT.value))
+    for name, sizes in _SIZES.items():
+        for size in sizes[: 2 if _TINY.value else None]:
+            config = make_config("reach", preset="paper")
+            config.network.mixed_precision = common.ACCELERATED
+            frames = size if name == "time steps" else config.train.support_frames
+            config.train.support_frames = config.train.query_frames = frames
+            config.train.meta_batch = size if name == "meta-batch" else config.train.meta_batch
+            config.mil.inner_steps = size if name == "inner steps" else config.mil.inner_steps
+            rows = size if name == "image rows" else config.env.image_shape[0]
+            config.env.image_shape = (rows, rows * 5 // 4)
+            report.attempt(f"{name} {size}", "ms", lambda config=config: measure(config))
+
+
+if __name__ == "__main__":
+    app.run(main)

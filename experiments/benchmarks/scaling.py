@@ -1,0 +1,58 @@
+"""Weak scaling: the push-sized meta-step, rendering included, with 15 tasks on each of 1, 2, 4, ... devices.
+
+    python experiments/benchmarks/scaling.py
+
+The step on n devices does n times the work; an efficiency of 1 means that it takes no longer than on one.
+"""
+
+import pathlib
+
+import common
+import jax
+import push_sized
+import workload
+from absl import app, flags
+from jax.sharding import Mesh
+
+from milx import methods, parallel, platform
+from milx.policy import spec_of
+from milx.trainer import Trainer, make_optimizer
+
+_OUT = flags.DEFINE_string("out", str(common.RESULTS), "Folder of the JSON file.")
+_TASKS = flags.DEFINE_integer("tasks", 15, "Tasks on each device.")
+_FRAMES = flags.DEFINE_integer("frames", None, "Time steps of a demonstration; all by default.")
+
+
+def measure(devices: int) -> tuple[float, float]:
+    """Median ms of a step in a scan on so many devices, and GiB on each."""
+    mesh = Mesh(jax.devices()[:devices], (parallel.AXIS,))
+    parallel.mesh = lambda: mesh  # type: ignore[assignment]
+    frames = _FRAMES.value
+    config = push_sized.config(meta_batch=devices * _TASKS.value, support_frames=frames, query_frames=frames)
+    config.network.mixed_precision = common.ACCELERATED
+    env, steps = push_sized.PushSized(), 20 if common.ACCELERATED else 1
+    trainer = Trainer(env, methods.make(config, spec_of(env)), config.train, make_optimizer(config.optimizer, 100))
+    state, demos = trainer.init(jax.random.key(0), workload.unit_whitening(env)), workload.random_demos(env, 64, 4)
+    whole = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec())
+    inputs = jax.device_put((state, demos, jax.random.key(1)), whole)
+    compiled = Trainer.run.lower(trainer, *inputs, steps).compile(platform.pixel_options())
+    return common.median_ms(compiled, *inputs, repeats=5) / steps, common.gib(compiled)
+
+
+def main(_: list[str]) -> None:
+    """Measures and writes the JSON file."""
+    report = common.Report("scaling", pathlib.Path(_OUT.value))
+    devices, alone = 1, None
+    while devices <= jax.device_count():
+        report.attempt(
+            f"{devices} devices", "ms", lambda devices=devices: measure(devices), f"{_TASKS.value} tasks each"
+        )
+        taken = report.rows[-1]["median"]
+        alone = alone or taken
+        if alone and taken:
+            report.add(f"{devices} devices, efficiency", alone / taken, "")
+        devices *= 2
+
+
+if __name__ == "__main__":
+    app.run(main)

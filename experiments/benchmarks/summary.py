@@ -1,0 +1,58 @@
+"""Prints the benchmarks in experiments/results/benchmarks/ as one Markdown table, and draws them.
+
+python experiments/benchmarks/summary.py docs/benchmarks.png
+"""
+
+import json
+import pathlib
+import sys
+
+import matplotlib.pyplot as plt
+from matplotlib.ticker import NullFormatter
+
+FOLDER = pathlib.Path(__file__).parents[1] / "results" / "benchmarks"
+
+
+def number(row: dict) -> str:
+    """The median of a row, or that there is none."""
+    return "not run" if row["median"] is None else f"{row['median']:,.4g} {row['unit']}".strip()
+
+
+def table(results: list[dict]) -> str:
+    """All rows of all files."""
+    lines = ["| benchmark | what | median | memory | on | commit |", "|---|---|---|---|---|---|"]
+    for result in results:
+        for row in result["rows"]:
+            memory = "" if row["peak_memory_gib"] is None else f"{row['peak_memory_gib']:.2f} GiB"
+            cells = [result["benchmark"], row["name"], number(row), memory, result["hardware"], result["commit"][:7]]
+            lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def draw(results: list[dict], path: pathlib.Path) -> None:
+    """One panel of bars for every file, what was not run left out."""
+    figure, axes = plt.subplots(len(results), 1, figsize=(9, 2.2 * len(results)), squeeze=False, layout="constrained")
+    for axis, result in zip(axes[:, 0], results, strict=True):
+        rows = [row for row in result["rows"] if row["median"] is not None]
+        labels = [f"{row['name']} ({row['unit']})" for row in rows]
+        bars = axis.barh(labels, [row["median"] for row in rows], color="tab:blue")
+        axis.bar_label(bars, [f" {row['median']:,.3g}" for row in rows], fontsize=6)
+        axis.set(xscale="log", title=f"{result['benchmark']}, {result['hardware']}")
+        axis.invert_yaxis()
+        axis.xaxis.set_minor_formatter(NullFormatter())
+        axis.tick_params(labelsize=6)
+        axis.title.set_fontsize(8)
+        axis.margins(x=0.15)
+    figure.savefig(path, dpi=150)
+    plt.close(figure)
+
+
+def main(path: str) -> None:
+    """Prints the table, writes the plot."""
+    results = [json.loads(file.read_text()) for file in sorted(FOLDER.glob("*.json"))]
+    print(table(results))
+    draw(results, pathlib.Path(path))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])
