@@ -50,6 +50,8 @@ class NetworkConfig:
         strides: stride of each convolution.
         kernel: height and width of every kernel.
         mixed_precision: convolve in bfloat16; parameters, norms and all other layers stay in float32.
+        rematerialise: keep only the inputs of each convolution for the backward pass and compute the rest a second
+            time: less memory, more time, the same results.
         soft_argmax: spatial soft-argmax after the last convolution, with a learned temperature; flattened otherwise.
         fc_layers: sizes of the hidden fully connected layers.
         fc_norm: layer norm in the hidden fully connected layers.
@@ -63,6 +65,7 @@ class NetworkConfig:
     strides: tuple[int, ...] = (2, 2, 2)
     kernel: int = 3
     mixed_precision: bool = False
+    rematerialise: bool = False
     soft_argmax: bool = False
     fc_layers: tuple[int, ...] = (200, 200, 200, 200)
     fc_norm: bool = True

@@ -125,14 +125,17 @@ def measure_domain(name: str) -> None:
     sizes = f"{tasks} tasks x 2 x {frames} frames of {env.image_shape[1]}x{env.image_shape[0]}"
     repeats = 20 if common.ACCELERATED else 3
 
-    def gradient(mixed: bool) -> tuple[float, float]:
-        changed = dataclasses.replace(config, network=dataclasses.replace(config.network, mixed_precision=mixed))
-        compiled, params = compile_gradient(changed, env, batch)
+    def variant(mixed: bool, rematerialise: bool = False) -> Config:
+        network = dataclasses.replace(config.network, mixed_precision=mixed, rematerialise=rematerialise)
+        return dataclasses.replace(config, network=network)
+
+    def gradient(*changes: bool) -> tuple[float, float]:
+        compiled, params = compile_gradient(variant(*changes), env, batch)
         return common.median_ms(compiled, params, batch, repeats=repeats), common.gib(compiled)
 
     def whole_step(mixed: bool) -> tuple[float, float]:
-        changed = dataclasses.replace(config, network=dataclasses.replace(config.network, mixed_precision=mixed))
-        trainer = Trainer(env, methods.make(changed, spec_of(env)), config.train, make_optimizer(config.optimizer, 100))
+        method = methods.make(variant(mixed), spec_of(env))
+        trainer = Trainer(env, method, config.train, make_optimizer(config.optimizer, 100))
         state, demos = trainer.init(jax.random.key(0), workload.unit_whitening(env)), workload.random_demos(env, 32, 4)
         steps = 20 if common.ACCELERATED else 2
         compiled = Trainer.run.lower(trainer, state, demos, jax.random.key(1), steps).compile(platform.pixel_options())
@@ -143,6 +146,7 @@ def measure_domain(name: str) -> None:
         kind = "bfloat16" if mixed else "float32"
         report.attempt(f"milx, {kind}", "ms", lambda mixed=mixed: gradient(mixed), sizes)
         report.attempt(f"milx, {kind}, whole step with rendering", "ms", lambda mixed=mixed: whole_step(mixed))
+    report.attempt("milx, rematerialised", "ms", lambda: gradient(accelerated, True))
     ours, layers.conv2d = layers.conv2d, lax_convolution
     for mixed in (True, False) if accelerated else (False,):
         kind = "bfloat16" if mixed else "float32"

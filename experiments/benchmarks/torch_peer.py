@@ -20,6 +20,13 @@ def same(x: torch.Tensor, kernel: int, stride: int) -> torch.Tensor:
     return functional.pad(x, pads)
 
 
+def norm(x: torch.Tensor) -> torch.Tensor:
+    """Layer norm over all axes but the first; written out, for the sake of its second derivative."""
+    axes = tuple(range(1, x.ndim))
+    centred = x - x.mean(axes, keepdim=True)
+    return centred * torch.rsqrt(centred.square().mean(axes, keepdim=True) + 1e-6)
+
+
 def make_params(config: Config, image: tuple[int, int], state: int, action: int) -> dict[str, torch.Tensor]:
     """Random parameters."""
     net, params, channels, (height, width) = config.network, {}, 3, image
@@ -53,7 +60,7 @@ def make_step(config: Config, mode: str, bf16: bool) -> Callable[..., dict[str, 
         for i, stride in enumerate(net.strides):
             x = functional.conv2d(same(x, net.kernel, stride), params[f"conv{i}"].to(dtype), stride=stride)
             x = x.float() + params[f"bias{i}"][:, None, None]
-            x = functional.layer_norm(x, x.shape[1:], eps=1e-6) + params[f"centre{i}"][:, None, None]
+            x = norm(x) + params[f"centre{i}"][:, None, None]
             x = functional.relu(x).to(dtype)
         x = x.float()
         if net.soft_argmax:
@@ -64,7 +71,7 @@ def make_step(config: Config, mode: str, bf16: bool) -> Callable[..., dict[str, 
         x = torch.cat([x.flatten(1), state, params["z"].expand(len(x), -1)], -1)
         for i in range(depth):
             x = x @ params[f"fc{i}"] + params[f"fb{i}"]
-            x = functional.relu(functional.layer_norm(x, x.shape[1:], eps=1e-6) if net.fc_norm else x)
+            x = functional.relu(norm(x) if net.fc_norm else x)
         return x @ params[f"fc{depth + head}"] + params[f"fb{depth + head}"]
 
     def loss(params: dict, image: torch.Tensor, state: torch.Tensor, action: torch.Tensor, head: int) -> torch.Tensor:

@@ -47,8 +47,9 @@ class _Policy(nn.Module):
     def __call__(self, image: jax.Array, state: jax.Array) -> PolicyOutput:
         config = self.config
         x = image.astype(state.dtype) / 255.0
-        for filters, stride in zip(config.filters, config.strides, strict=True):
-            x = ConvBlock(filters, config.kernel, stride, config.mixed_precision)(x)
+        block = nn.remat(ConvBlock) if config.rematerialise else ConvBlock
+        for i, (filters, stride) in enumerate(zip(config.filters, config.strides, strict=True)):
+            x = block(filters, config.kernel, stride, config.mixed_precision, name=f"ConvBlock_{i}")(x)
         x = x.astype(state.dtype)
         if config.soft_argmax:
             x = spatial_soft_argmax(x, jnp.exp(self.param("log_temperature", nn.initializers.zeros, x.shape[-1:])))

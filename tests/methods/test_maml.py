@@ -354,6 +354,20 @@ def test_mixed_precision_keeps_the_meta_gradient_and_its_type(batch):
     assert 1e-5 < distance < 0.05
 
 
+def test_rematerialisation_keeps_the_meta_gradient_and_less_memory(batch):
+    (plain, params), (frugal, _) = build(), build({"rematerialise": True})
+    found, expected = (jax.jit(jax.grad(lambda p, m=m: m.loss(p, batch)[0]))(params) for m in (frugal, plain))
+    assert_trees_close(found["policy"], expected["policy"])
+
+    def kept(method):
+        """Bytes that the backward pass of plain imitation waits for, parameters and images included."""
+        demo = jax.tree.map(lambda x: x[0], batch.query)
+        loss = lambda theta: method.imitation_loss(theta, params["whitening"], demo)[0]  # noqa: E731
+        return sum(leaf.nbytes for leaf in jax.tree.leaves(jax.vjp(loss, params["policy"])[1]))
+
+    assert kept(frugal) < 0.5 * kept(plain)
+
+
 def test_an_unknown_method_is_told_the_known_ones():
     spec = methods.Spec(IMAGE_SHAPE, STATE, ACTION, ((-1,) * ACTION, (1,) * ACTION), GOAL_INDICES)
     with pytest.raises(ValueError, match="method: got 'maml', expected one of mil"):
