@@ -1,4 +1,4 @@
-"""Prints the results in experiments/results/<experiment>/ as a Markdown table, with the mean over seeds.
+"""Prints the results in experiments/results/<experiment>/ as a Markdown table, with the mean over runs.
 
 python experiments/table.py reach
 """
@@ -33,14 +33,14 @@ def row(result: dict) -> str:
 
 
 def mean(group: list[dict]) -> str:
-    """The mean over the seeds of one setting as a line of the table."""
+    """The mean over the runs of one setting as a line of the table."""
     successes = [result["success"] for result in group]
     floors = [statistics.mean(r["baselines"][name] for r in group) for name in ("random", "task_blind", "expert")]
     cells = [
         group[0]["method"],
         setting(group[0]),
         f"mean of {len(group)}",
-        f"**{statistics.mean(successes):.1%}** (seeds {min(successes):.1%} to {max(successes):.1%})",
+        f"**{statistics.mean(successes):.1%}** ({min(successes):.1%} to {max(successes):.1%})",
         str(sum(result["trials"] for result in group)),
         *(f"{floor:.1%}" for floor in floors),
         f"{statistics.mean(result['wall_clock_s']['total'] for result in group):.0f} s",

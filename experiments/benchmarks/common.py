@@ -1,6 +1,7 @@
 """What all benchmarks share: timing, and one JSON file of rows in experiments/results/benchmarks/."""
 
 import dataclasses
+import importlib.metadata
 import json
 import pathlib
 import statistics
@@ -30,8 +31,15 @@ def median_ms(
 
 
 def gib(compiled: jax.stages.Compiled) -> float:
-    """Memory that a compiled program needs beside its arguments and results."""
+    """Memory that a compiled program needs beside its arguments and results; PyTorch's figures include those."""
     return compiled.memory_analysis().temp_size_in_bytes / 2**30
+
+
+def _version(package: str) -> str:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed"
 
 
 @dataclasses.dataclass
@@ -55,15 +63,19 @@ class Report:
         print(f"{self.benchmark:10s} {name:60s} {value:>20s} {note}", flush=True)
         self.folder.mkdir(parents=True, exist_ok=True)
         content = {"benchmark": self.benchmark, **provenance.describe(), "rows": self.rows}
-        name = self.benchmark if ACCELERATED else f"{self.benchmark}-cpu"
-        (self.folder / f"{name}.json").write_text(json.dumps(content, indent=1) + "\n")
+        content["versions"] |= {peer: _version(peer) for peer in ("torch", "warp-lang")}
+        file = self.benchmark if ACCELERATED else f"{self.benchmark}-cpu"
+        (self.folder / f"{file}.json").write_text(json.dumps(content, indent=1) + "\n")
 
-    def attempt(self, name: str, unit: str, measure: Callable[[], tuple[float, float | None]], note: str = "") -> None:
-        """Adds what `measure` returns, (median, memory); if it cannot run here, says so instead."""
+    def measure(self, name: str, unit: str, function: Callable[[], tuple[float, float | None]], note: str = "") -> None:
+        """Adds what `function` returns: (median, memory)."""
+        median, memory = function()
+        self.add(name, median, unit, memory, note)
+
+    def attempt(self, name: str, unit: str, function: Callable[[], tuple[float, float | None]], note: str = "") -> None:
+        """The same for a peer; if it cannot run here, says so instead."""
         try:
-            median, memory = measure()
+            self.measure(name, unit, function, note)
         except Exception as error:  # whatever keeps a peer from running is the finding
             text = str(error).strip().splitlines()
-            self.add(name, None, unit, note=f"not run: {type(error).__name__}: {text[0][:150] if text else ''}")
-        else:
-            self.add(name, median, unit, memory, note)
+            self.add(name, None, unit, note=f"{type(error).__name__}: {text[0][:150] if text else ''}")

@@ -50,7 +50,7 @@ def main(_: list[str]) -> None:
             config.mil.inner_steps = size if name == "inner steps" else config.mil.inner_steps
             rows = size if name == "image rows" else config.env.image_shape[0]
             config.env.image_shape = (rows, rows * 5 // 4)
-            report.attempt(f"{name} {size}", "ms", lambda config=config: measure(config))
+            report.measure(f"{name} {size}", "ms", lambda config=config: measure(config))
 
 
 if __name__ == "__main__":

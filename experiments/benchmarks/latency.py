@@ -14,8 +14,9 @@ import jax
 import push_sized
 import workload
 from absl import app, flags
+from jax.experimental.compilation_cache import compilation_cache
 
-from milx import envs, evaluator, methods
+from milx import envs, evaluator, methods, platform
 from milx.config import Config, make_config
 from milx.envs.base import Env
 from milx.policy import Policy, spec_of
@@ -72,8 +73,9 @@ def measure_compilation(config: Config, env: Env, report: common.Report) -> None
         jax.config.update("jax_compilation_cache_dir", folder)
         for name in ("without a cache", "from the cache"):
             jax.clear_caches()
+            compilation_cache.reset_cache()  # JAX would go on with the folder it used first
             began = time.perf_counter()
-            Trainer.run.lower(trainer, state, demos, jax.random.key(1), 100).compile()
+            Trainer.run.lower(trainer, state, demos, jax.random.key(1), 100).compile(platform.pixel_options())
             report.add(f"tracing and compiling the training scan, {name}", time.perf_counter() - began, "s")
 
 

@@ -57,7 +57,7 @@ def lax_convolution(x: jax.Array, kernel: jax.Array, stride: int) -> jax.Array:
 
 
 def floor_ms(config: Config, env: Env, tasks: int, frames: int) -> tuple[float, str]:
-    """The least time of a meta-gradient: operations and bytes over ceilings that are measured here.
+    """An estimate of the least time of a meta-gradient: operations and bytes over ceilings that are measured here.
 
     Convolutions in bfloat16, fully connected layers left out. A forward pass counts 1, a backward pass 2 (1 for the
     first layer, which needs no gradient of the image); the support demonstration takes one of each, and twice that
@@ -106,9 +106,9 @@ def measure_torch(config: Config, env: Env, batch: TaskBatch, mode: str, bf16: b
     torch.manual_seed(0)
     params = torch_peer.make_params(config, env.image_shape, env.state_size, env.action_size)
     step = torch_peer.make_step(config, mode, bf16)
-    torch.cuda.reset_peak_memory_stats()
     for _ in range(3):
         step(params, *data)
+    torch.cuda.reset_peak_memory_stats()
     milliseconds = common.median_ms(step, params, *data, wait=lambda _: torch.cuda.synchronize())
     memory = torch.cuda.max_memory_allocated() / 2**30
     torch.cuda.empty_cache()
@@ -144,9 +144,9 @@ def measure_domain(name: str) -> None:
     accelerated = common.ACCELERATED
     for mixed in (True, False) if accelerated else (False,):
         kind = "bfloat16" if mixed else "float32"
-        report.attempt(f"milx, {kind}", "ms", lambda mixed=mixed: gradient(mixed), sizes)
-        report.attempt(f"milx, {kind}, whole step with rendering", "ms", lambda mixed=mixed: whole_step(mixed))
-    report.attempt("milx, rematerialised", "ms", lambda: gradient(accelerated, True))
+        report.measure(f"milx, {kind}", "ms", lambda mixed=mixed: gradient(mixed), f"{sizes}, called one by one")
+        report.measure(f"milx, {kind}, whole step with rendering", "ms", lambda m=mixed: whole_step(m), "in a scan")
+    report.measure("milx, rematerialised", "ms", lambda: gradient(accelerated, True))
     ours, layers.conv2d = layers.conv2d, lax_convolution
     for mixed in (True, False) if accelerated else (False,):
         kind = "bfloat16" if mixed else "float32"

@@ -59,13 +59,13 @@ def measure_mjx(env: push_sized.PushSized, worlds: int, impl: str) -> tuple[floa
 
 def measure_rollout(env: push_sized.PushSized, worlds: int, threads: int) -> tuple[float, None]:
     """Substeps/s of C MuJoCo on so many threads."""
-    model, steps = env.mj_model, 100
+    model, steps = env.mj_model, env.substeps
     datas = [mujoco.MjData(model) for _ in range(threads)]
     state = np.zeros((worlds, mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)))
     task = env.sample_task(jax.random.key(0), "train")
     keys = jax.random.split(jax.random.key(1), worlds)
     state[:, 1 : 1 + model.nq] = jax.vmap(lambda key: env.reset(key, task).qpos)(keys)
-    control = np.random.default_rng(0).uniform(-1, 1, (worlds, steps, model.nu))
+    control = np.random.default_rng(0).uniform(-1, 1, (worlds, 1, model.nu)).repeat(steps, axis=1)
     with mujoco.rollout.Rollout(nthread=threads) as rollout:
         milliseconds = common.median_ms(lambda: rollout.rollout(model, datas, state, control), repeats=5)
     return 1e3 * worlds * steps / milliseconds, None
@@ -96,14 +96,14 @@ def main(_: list[str]) -> None:
     accelerated = common.ACCELERATED
     worlds = _WORLDS.value or (8192 if accelerated else 64)
     points = _POINTS.value or (2048 if accelerated else 32)
-    note, unit = f"{worlds} worlds, nv = {env.mj_model.nv}, contacts", "substeps/s"
-    report.attempt("milx, Env.step", unit, lambda: measure_milx(env, worlds), note)
+    note, unit = f"{worlds} worlds, nv = {env.mj_model.nv}, {env.mj_model.npair} contact pairs, apart", "substeps/s"
+    report.measure("milx, Env.step", unit, lambda: measure_milx(env, worlds), note)
     report.attempt("MJX-JAX, mjx.step", unit, lambda: measure_mjx(env, worlds, "jax"), note)
     report.attempt("MJX-Warp, mjx.step", unit, lambda: measure_mjx(env, worlds, "warp"), note)
     threads = os.cpu_count() or 1
-    report.attempt("mujoco.rollout", unit, lambda: measure_rollout(env, 4 * threads, threads), f"{threads} threads")
+    report.attempt("mujoco.rollout", unit, lambda: measure_rollout(env, worlds, threads), f"{threads} threads")
     for how in ("jacfwd", "mapped jvp"):
-        report.attempt(
+        report.measure(
             f"Jacobians, {how}", "1/s", lambda how=how: measure_jacobians(env, points, how), f"{points} at once"
         )
 

@@ -83,6 +83,7 @@ def measure_opengl(model: mujoco.MjModel, camera: str, image_shape: tuple[int, i
     """Frames/s of `mujoco.Renderer`."""
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
+    model.vis.quality.offsamples = 0  # one sample in a pixel, as milx
     with mujoco.Renderer(model, *image_shape) as renderer:
         renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
 
@@ -116,10 +117,10 @@ def main(_: list[str]) -> None:
         height, width = env.image_shape
         name = f"{env.name}, {env.mj_model.ngeom} geoms, {width}x{height}"
         draw = env.renderer.pixels
-        report.attempt(f"{name}: milx", "frames/s", lambda e=env, d=draw: measure_milx(e, count, d), note)
+        report.measure(f"{name}: milx", "frames/s", lambda e=env, d=draw: measure_milx(e, count, d), note)
         if common.ACCELERATED:
             draw = lambda scene, r=env.renderer: to_uint8(r.render(scene).color)  # noqa: E731
-            report.attempt(f"{name}: milx, XLA", "frames/s", lambda e=env, d=draw: measure_milx(e, count, d), note)
+            report.measure(f"{name}: milx, XLA", "frames/s", lambda e=env, d=draw: measure_milx(e, count, d), note)
         report.attempt(f"{name}: MJX-Warp", "frames/s", lambda e=env: measure_warp(e, count), note)
         report.attempt(f"{name}: mujoco.Renderer", "frames/s", lambda e=env: measure_opengl_elsewhere(e), "one by one")
 

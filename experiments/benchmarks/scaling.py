@@ -44,13 +44,10 @@ def main(_: list[str]) -> None:
     report = common.Report("scaling", pathlib.Path(_OUT.value))
     devices, alone = 1, None
     while devices <= jax.device_count():
-        report.attempt(
-            f"{devices} devices", "ms", lambda devices=devices: measure(devices), f"{_TASKS.value} tasks each"
-        )
-        taken = report.rows[-1]["median"]
-        alone = alone or taken
-        if alone and taken:
-            report.add(f"{devices} devices, efficiency", alone / taken, "")
+        milliseconds, memory = measure(devices)
+        alone = alone or milliseconds
+        report.add(f"{devices} devices", milliseconds, "ms", memory, f"{_TASKS.value} tasks each")
+        report.add(f"{devices} devices, efficiency", alone / milliseconds, "")
         devices *= 2
 
 

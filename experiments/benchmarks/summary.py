@@ -15,7 +15,7 @@ FOLDER = pathlib.Path(__file__).parents[1] / "results" / "benchmarks"
 
 def number(row: dict) -> str:
     """The median of a row, or that there is none."""
-    return "not run" if row["median"] is None else f"{row['median']:,.4g} {row['unit']}".strip()
+    return f"not run ({row['note']})" if row["median"] is None else f"{row['median']:,.4g} {row['unit']}".strip()
 
 
 def table(results: list[dict]) -> str:

@@ -40,7 +40,7 @@ def make_params(config: Config, image: tuple[int, int], state: int, action: int)
     for i, size in enumerate((*net.fc_layers, *[action] * net.heads)):
         params[f"fc{i}"], params[f"fb{i}"] = torch.randn(features, size) / features**0.5, torch.zeros(size)
         features = size if i < len(net.fc_layers) else features
-    return {name: value.cuda().requires_grad_() for name, value in params.items()}
+    return {name: value.cuda() for name, value in params.items()}
 
 
 def make_step(config: Config, mode: str, bf16: bool) -> Callable[..., dict[str, torch.Tensor]]:
@@ -56,7 +56,7 @@ def make_step(config: Config, mode: str, bf16: bool) -> Callable[..., dict[str, 
     dtype = torch.bfloat16 if bf16 else torch.float32
 
     def forward(params: dict, image: torch.Tensor, state: torch.Tensor, head: int) -> torch.Tensor:
-        x = (image.permute(0, 3, 1, 2).float() / 255).to(dtype)
+        x = (image.permute(0, 3, 1, 2).float() / 255).to(dtype).contiguous()
         for i, stride in enumerate(net.strides):
             x = functional.conv2d(same(x, net.kernel, stride), params[f"conv{i}"].to(dtype), stride=stride)
             x = x.float() + params[f"bias{i}"][:, None, None]
@@ -89,6 +89,8 @@ def make_step(config: Config, mode: str, bf16: bool) -> Callable[..., dict[str, 
         return torch.func.grad(lambda params: tasks(params, image, state, action).mean())(params)
 
     def by_loop(params: dict, image: torch.Tensor, state: torch.Tensor, action: torch.Tensor) -> dict:
+        # Only here: torch.func would record a graph of its own work for parameters that require gradients.
+        params = {name: value.detach().requires_grad_() for name, value in params.items()}
         names, total = list(params), dict.fromkeys(params, 0.0)
         for i, s, a in zip(image, state, action, strict=True):
             inner = loss(params, i[0], s[0], a[0], 0)

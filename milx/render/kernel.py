@@ -74,7 +74,7 @@ def bounding_radius(geom_type: np.ndarray, geom_size: jax.Array) -> jax.Array:
 
 def light_table(lights: shade.Lights) -> jax.Array:
     """[L, 21] all lights, field by field."""
-    return jnp.column_stack(lights)
+    return jnp.column_stack(lights).astype(jnp.float32)
 
 
 def paint(

@@ -24,7 +24,7 @@ _SHOWN_GROUPS = 3
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """What can vary from frame to frame; float32, in world coordinates.
+    """What can vary from frame to frame, in world coordinates.
 
     A geom whose alpha is 0 is not seen and casts no shadow; any other alpha is opaque.
     """
@@ -48,8 +48,8 @@ class Scene:
 class Frame:
     """An image."""
 
-    color: jax.Array  # [H, W, 3] float32 in [0, 1]
-    depth: jax.Array  # [H, W] float32, m along the optical axis, infinite where nothing is hit
+    color: jax.Array  # [H, W, 3] in [0, 1]
+    depth: jax.Array  # [H, W] m along the optical axis, infinite where nothing is hit
     geom_id: jax.Array  # [H, W] int32, MuJoCo's geom id, -1 where nothing is hit
 
 

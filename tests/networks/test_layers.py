@@ -60,6 +60,16 @@ def test_convolution_and_its_derivatives_are_those_of_lax(rng, convolve, shape, 
         )
 
 
+def test_blocks_in_bfloat16_are_as_exact_as_their_products(rng):
+    """Products and sums of four of them are rounded to 8 bits: on average by less than one unit in the last place."""
+    x, kernel = (jnp.asarray(rng.standard_normal(shape)) for shape in ((4, 16, 20, 40), (3, 3, 40, 40)))
+    x, kernel = (value.astype(jnp.bfloat16).astype(float) for value in (x, kernel))
+    exact = layers.convolve_blocks(x, kernel, 2)
+    rough = layers.convolve_blocks(x.astype(jnp.bfloat16), kernel.astype(jnp.bfloat16), 2)
+    distance = jnp.linalg.norm(rough.astype(float) - exact) / jnp.linalg.norm(exact)
+    assert 1e-4 < distance < 2**-8
+
+
 @pytest.mark.parametrize("filters", [2, 40])
 def test_blocks_that_are_put_side_by_side_or_added_give_the_same(rng, filters):
     """With 3 channels and stride 2, blocks are put side by side for more than 12 filters, and added otherwise."""

@@ -54,6 +54,13 @@ def test_kernel_passes_over_geoms_without_alpha():
     assert changed[seen != hidden].mean() < 2e-3
 
 
+def test_kernel_paints_in_float32_whatever_the_scene_is_in():
+    single = render_both(1)[0]
+    with jax.enable_x64(True):
+        double = render_both(1)[0]
+    assert (np.abs(double - single).max(axis=-1) > 1).mean() < 2e-3
+
+
 def test_bounding_balls_touch_the_farthest_point_of_every_geom():
     size = np.random.default_rng(0).uniform(0.1, 1, (6, 3))
     geom = mujoco.mjtGeom
