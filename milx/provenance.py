@@ -5,6 +5,7 @@ import os
 import pathlib
 import platform
 import subprocess
+from collections.abc import Iterable
 from typing import Any
 
 import jax
@@ -14,7 +15,7 @@ _PACKAGES = ("milx", "jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "
 
 def describe() -> dict[str, Any]:
     """Commit (with "-dirty" for a changed tree; None outside a checkout), hardware and versions, for a result file."""
-    return {"commit": _commit(), "hardware": _hardware(), "versions": _versions()}
+    return {"commit": _commit(), "hardware": _hardware(), "versions": versions(_PACKAGES)}
 
 
 def _commit() -> str | None:
@@ -35,11 +36,12 @@ def _hardware() -> str:
     return f"{len(devices)} x {kind}, {os.cpu_count()} CPU cores"
 
 
-def _versions() -> dict[str, str]:
-    versions = {"python": platform.python_version()}
-    for package in _PACKAGES:
+def versions(packages: Iterable[str]) -> dict[str, str]:
+    """Python's version and those of packages, "not installed" for those that lack."""
+    found = {"python": platform.python_version()}
+    for package in packages:
         try:
-            versions[package] = importlib.metadata.version(package)
+            found[package] = importlib.metadata.version(package)
         except importlib.metadata.PackageNotFoundError:
-            versions[package] = "not installed"
-    return versions
+            found[package] = "not installed"
+    return found

@@ -1,7 +1,6 @@
 """What all benchmarks share: timing, and one JSON file of rows in experiments/results/benchmarks/."""
 
 import dataclasses
-import importlib.metadata
 import json
 import pathlib
 import statistics
@@ -35,13 +34,6 @@ def gib(compiled: jax.stages.Compiled) -> float:
     return compiled.memory_analysis().temp_size_in_bytes / 2**30
 
 
-def _version(package: str) -> str:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return "not installed"
-
-
 @dataclasses.dataclass
 class Report:
     """Rows of one benchmark, printed as they come and written as JSON after each, so that a crash loses none.
@@ -63,7 +55,7 @@ class Report:
         print(f"{self.benchmark:10s} {name:60s} {value:>20s} {note}", flush=True)
         self.folder.mkdir(parents=True, exist_ok=True)
         content = {"benchmark": self.benchmark, **provenance.describe(), "rows": self.rows}
-        content["versions"] |= {peer: _version(peer) for peer in ("torch", "warp-lang")}
+        content["versions"] |= provenance.versions(("torch", "warp-lang"))
         file = self.benchmark if ACCELERATED else f"{self.benchmark}-cpu"
         (self.folder / f"{file}.json").write_text(json.dumps(content, indent=1) + "\n")
 
