@@ -8,14 +8,11 @@ The paper's reach network, rendering included; one size changes at a time.
 import pathlib
 
 import common
-import jax
 import workload
 from absl import app, flags
 
-from milx import envs, methods, platform
-from milx.config import Config, make_config
-from milx.policy import spec_of
-from milx.trainer import Trainer, make_optimizer
+from milx import envs
+from milx.config import make_config
 
 _OUT = flags.DEFINE_string("out", str(common.RESULTS), "Folder of the JSON file.")
 _TINY = flags.DEFINE_bool("tiny", False, "Two sizes of each, for a try.")
@@ -25,16 +22,6 @@ _SIZES = {
     "image rows": (32, 64, 128),
     "inner steps": (1, 3, 5),
 }
-
-
-def measure(config: Config) -> tuple[float, float]:
-    """Median ms of a step in a scan, and GiB."""
-    env = envs.make("reach", config.env.image_shape)
-    trainer = Trainer(env, methods.make(config, spec_of(env)), config.train, make_optimizer(config.optimizer, 100))
-    state = trainer.init(jax.random.key(0), workload.unit_whitening(env))
-    demos, key, steps = workload.random_demos(env, 32, 4), jax.random.key(1), 20 if common.ACCELERATED else 1
-    compiled = Trainer.run.lower(trainer, state, demos, key, steps).compile(platform.pixel_options())
-    return common.median_ms(compiled, state, demos, key, repeats=3) / steps, common.gib(compiled)
 
 
 def main(_: list[str]) -> None:
@@ -50,7 +37,9 @@ def main(_: list[str]) -> None:
             config.mil.inner_steps = size if name == "inner steps" else config.mil.inner_steps
             rows = size if name == "image rows" else config.env.image_shape[0]
             config.env.image_shape = (rows, rows * 5 // 4)
-            report.measure(f"{name} {size}", "ms", lambda config=config: measure(config))
+            report.measure(
+                f"{name} {size}", "ms", lambda c=config: workload.measure_step(c, envs.make("reach", c.env.image_shape))
+            )
 
 
 if __name__ == "__main__":

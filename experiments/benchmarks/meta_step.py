@@ -26,7 +26,6 @@ from milx.config import Config, make_config
 from milx.envs.base import Env
 from milx.networks import layers
 from milx.policy import spec_of
-from milx.trainer import Trainer, make_optimizer
 from milx.types import TaskBatch
 
 _OUT = flags.DEFINE_string("out", str(common.RESULTS), "Folder of the JSON file.")
@@ -133,19 +132,16 @@ def measure_domain(name: str) -> None:
         compiled, params = compile_gradient(variant(*changes), env, batch)
         return common.median_ms(compiled, params, batch, repeats=repeats), common.gib(compiled)
 
-    def whole_step(mixed: bool) -> tuple[float, float]:
-        method = methods.make(variant(mixed), spec_of(env))
-        trainer = Trainer(env, method, config.train, make_optimizer(config.optimizer, 100))
-        state, demos = trainer.init(jax.random.key(0), workload.unit_whitening(env)), workload.random_demos(env, 32, 4)
-        steps = 20 if common.ACCELERATED else 2
-        compiled = Trainer.run.lower(trainer, state, demos, jax.random.key(1), steps).compile(platform.pixel_options())
-        return common.median_ms(compiled, state, demos, jax.random.key(1), repeats=5) / steps, common.gib(compiled)
-
     accelerated = common.ACCELERATED
     for mixed in (True, False) if accelerated else (False,):
         kind = "bfloat16" if mixed else "float32"
         report.measure(f"milx, {kind}", "ms", lambda mixed=mixed: gradient(mixed), f"{sizes}, called one by one")
-        report.measure(f"milx, {kind}, whole step with rendering", "ms", lambda m=mixed: whole_step(m), "in a scan")
+        report.measure(
+            f"milx, {kind}, whole step with rendering",
+            "ms",
+            lambda m=mixed: workload.measure_step(variant(m), env),
+            "in a scan",
+        )
     report.measure("milx, rematerialised", "ms", lambda: gradient(accelerated, True))
     ours, layers.conv2d = layers.conv2d, lax_convolution
     for mixed in (True, False) if accelerated else (False,):

@@ -14,9 +14,7 @@ import workload
 from absl import app, flags
 from jax.sharding import Mesh
 
-from milx import methods, parallel, platform
-from milx.policy import spec_of
-from milx.trainer import Trainer, make_optimizer
+from milx import parallel
 
 _OUT = flags.DEFINE_string("out", str(common.RESULTS), "Folder of the JSON file.")
 _TASKS = flags.DEFINE_integer("tasks", 15, "Tasks on each device.")
@@ -30,13 +28,7 @@ def measure(devices: int) -> tuple[float, float]:
     frames = _FRAMES.value
     config = push_sized.config(meta_batch=devices * _TASKS.value, support_frames=frames, query_frames=frames)
     config.network.mixed_precision = common.ACCELERATED
-    env, steps = push_sized.PushSized(), 20 if common.ACCELERATED else 1
-    trainer = Trainer(env, methods.make(config, spec_of(env)), config.train, make_optimizer(config.optimizer, 100))
-    state, demos = trainer.init(jax.random.key(0), workload.unit_whitening(env)), workload.random_demos(env, 64, 4)
-    whole = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec())
-    inputs = jax.device_put((state, demos, jax.random.key(1)), whole)
-    compiled = Trainer.run.lower(trainer, *inputs, steps).compile(platform.pixel_options())
-    return common.median_ms(compiled, *inputs, repeats=5) / steps, common.gib(compiled)
+    return workload.measure_step(config, push_sized.PushSized())
 
 
 def main(_: list[str]) -> None:

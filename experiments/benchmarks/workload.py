@@ -1,12 +1,18 @@
-"""Inputs of the right sizes and no meaning."""
+"""Inputs of the right sizes and no meaning, and the training step on them."""
 
 from typing import Any
 
+import common
 import jax
 import jax.numpy as jnp
+from jax.sharding import NamedSharding, PartitionSpec
 
+from milx import methods, parallel, platform
+from milx.config import Config
 from milx.data.demos import DemoSet
 from milx.envs.base import Env, State
+from milx.policy import spec_of
+from milx.trainer import Trainer, make_optimizer
 from milx.types import Demo, TaskBatch
 from milx.whitening import Whitening
 
@@ -39,3 +45,13 @@ def random_demos(env: Env, num_tasks: int, num_demos: int) -> DemoSet:
     states = jax.vmap(jax.vmap(one, in_axes=(0, None)))(jax.random.split(keys[1], (num_tasks, num_demos)), tasks)
     action = jax.random.uniform(keys[2], (num_tasks, num_demos, env.horizon, env.action_size), minval=-1)
     return DemoSet(tasks, states, action, jnp.ones((num_tasks, num_demos), bool))
+
+
+def measure_step(config: Config, env: Env) -> tuple[float, float]:
+    """Median ms of a training step, rendering included, in a scan on the devices of the mesh; and GiB on each."""
+    trainer = Trainer(env, methods.make(config, spec_of(env)), config.train, make_optimizer(config.optimizer, 100))
+    inputs = trainer.init(jax.random.key(0), unit_whitening(env)), random_demos(env, 64, 4), jax.random.key(1)
+    inputs = jax.device_put(inputs, NamedSharding(parallel.mesh(), PartitionSpec()))
+    steps = 20 if common.ACCELERATED else 2
+    compiled = Trainer.run.lower(trainer, *inputs, steps).compile(platform.pixel_options())
+    return common.median_ms(compiled, *inputs, repeats=5) / steps, common.gib(compiled)
