@@ -127,8 +127,8 @@ class TrainConfig:
         shots: support demonstrations of each task.
         support_frames: time steps drawn from each support demonstration; None for all.
         query_frames: time steps drawn from each query demonstration; None for all.
-        redraw_appearance: show a task in new colours of the training split whenever it is drawn, so that few planned
-            demonstrations stand for many tasks.
+        redraw: whenever a task is drawn, show it in new colours of the training split, and its demonstrations among
+            distractors in new places: few planned demonstrations stand for many tasks and scenes.
         log_every: meta-updates in one scan on the device.
         eval_every: meta-updates between two validations; each is followed by a checkpoint.
     """
@@ -138,7 +138,7 @@ class TrainConfig:
     shots: int = 1
     support_frames: int | None = None
     query_frames: int | None = None
-    redraw_appearance: bool = False
+    redraw: bool = False
     log_every: int = 100
     eval_every: int = 2000
 
@@ -195,7 +195,7 @@ def _reach_fast() -> Config:
         ),
         mil=MILConfig(inner_lr=0.03, learn_inner_lr=True, whiten_actions=True, goal_weight=10.0),
         optimizer=OptimizerConfig(warmup=0.05, cosine=True, clip_norm=1.0),
-        train=TrainConfig(steps=36_000, meta_batch=32, support_frames=6, query_frames=6),
+        train=TrainConfig(steps=36_000, meta_batch=64, support_frames=3, query_frames=3, redraw=True),
     )
 
 
@@ -207,7 +207,7 @@ def _reach_cpu() -> Config:
     config.network.filters = (32, 32, 32)
     config.network.fc_layers = (100, 100)
     config.train = TrainConfig(
-        steps=14_000, meta_batch=8, support_frames=6, query_frames=6, redraw_appearance=True, eval_every=3500
+        steps=14_000, meta_batch=8, support_frames=6, query_frames=6, redraw=True, eval_every=3500
     )
     config.optimizer.learning_rate, config.optimizer.warmup = 2e-3, 0.02
     config.evaluation.validation_tasks = 25

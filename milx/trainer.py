@@ -73,7 +73,7 @@ class Trainer:
         def gradient(params: Params, demos: DemoSet, keys: jax.Array) -> tuple[Params, dict[str, jax.Array]]:
             train = self.train
             frames = train.support_frames, train.query_frames
-            batch = sample_batch(self.env, demos, keys, train.shots, *frames, train.redraw_appearance)
+            batch = sample_batch(self.env, demos, keys, train.shots, *frames, train.redraw)
             (loss, metrics), grad = jax.value_and_grad(self.method.loss, has_aux=True)(params, batch)
             return grad, {"loss": loss, **metrics}
 

@@ -113,7 +113,7 @@ def sample_batch(
     shots: int,
     support_frames: int | None = None,
     query_frames: int | None = None,
-    redraw_appearance: bool = False,
+    redraw: bool = False,
 ) -> TaskBatch:
     """Draws tasks and different demonstrations of each, and renders them.
 
@@ -124,7 +124,7 @@ def sample_batch(
         shots: K, support demonstrations; one more of the same task becomes the query.
         support_frames: time steps drawn from each support demonstration; None for all.
         query_frames: time steps drawn from the query demonstration; None for all.
-        redraw_appearance: show the demonstrations of a task in a new appearance of the training split.
+        redraw: show a task in a new appearance of the training split, and each of its demonstrations in a new scene.
     """
 
     def sample_task(key: jax.Array) -> TaskBatch:
@@ -132,11 +132,13 @@ def sample_batch(
         n = jax.random.randint(task_key, (), 0, demos.num_tasks)
         chosen = jax.random.choice(demo_key, demos.num_demos, (shots + 1,), replace=False)
         task = jax.tree.map(lambda x: x[n], demos.task)
-        if redraw_appearance:
+        if redraw:
             task = env.redraw_appearance(jax.random.fold_in(key, 1), task)
 
         def load(d: jax.Array, key: jax.Array, frames: int | None) -> Demo:
             states, action = jax.tree.map(lambda x: x[n, d], (demos.states, demos.action))
+            if redraw:
+                states = env.redraw_scene(jax.random.fold_in(key, 1), task, states)
             return render_demo(env, task, states, action, frame_indices(key, action.shape[0], frames))
 
         support = [load(chosen[k], jax.random.fold_in(support_key, k), support_frames) for k in range(shots)]

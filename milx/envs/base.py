@@ -107,6 +107,13 @@ class Env(abc.ABC):
         """The task with another appearance of the training split; its demonstrations are valid for both."""
 
     @abc.abstractmethod
+    def redraw_scene(self, key: jax.Array, task: Task, states: State) -> State:
+        """The same episode in another scene: what did not take part in it stands elsewhere, as `reset` would put it.
+
+        `states` has a leading axis T + 1. Where everything takes part, this is `states`.
+        """
+
+    @abc.abstractmethod
     def reset(self, key: jax.Array, task: Task) -> State:
         """Draws a scene of the task: the state at the start of an episode."""
 

@@ -78,12 +78,15 @@ class Reach(Env):
 
     def reset(self, key: jax.Array, task: ReachTask) -> State:
         """Stands the arm at zero and the cubes uniformly in the arena, at least SPACING apart."""
-        draws = jax.random.uniform(key, (_CANDIDATES, NUM_OBJECTS, 2), minval=-EXTENT, maxval=EXTENT)
-        gaps = jnp.linalg.norm(draws[:, [0, 0, 1]] - draws[:, [1, 2, 2]], axis=-1)
-        # The first draw that keeps the distances; each does with probability 0.31, so one of 64 always does.
-        position = draws[jnp.argmax(gaps.min(axis=-1) >= SPACING)]
+        position = _first_spaced(_draw_positions(key))
         height = jnp.full((NUM_OBJECTS, 1), self._height)
         return State(jnp.zeros(2), jnp.zeros(2), jnp.concatenate([position, height], axis=-1))
+
+    def redraw_scene(self, key: jax.Array, task: ReachTask, states: State) -> State:
+        """The same motion to the same place, with the two other cubes elsewhere."""
+        target = states.mocap_pos[0, task.target, :2]
+        position = _first_spaced(_draw_positions(key).at[:, task.target].set(target))
+        return dataclasses.replace(states, mocap_pos=states.mocap_pos.at[..., :2].set(position))
 
     @functools.partial(jax.jit, static_argnums=0)
     def fingertip(self, qpos: jax.Array) -> jax.Array:
@@ -136,6 +139,20 @@ class Reach(Env):
     def task_blind(self, key: jax.Array, task: ReachTask) -> ReachTask:
         """The task with a random cube as the target."""
         return dataclasses.replace(task, target=jax.random.randint(key, (), 0, NUM_OBJECTS))
+
+
+def _draw_positions(key: jax.Array) -> jax.Array:
+    """[_CANDIDATES, 3, 2] positions in the arena (m)."""
+    return jax.random.uniform(key, (_CANDIDATES, NUM_OBJECTS, 2), minval=-EXTENT, maxval=EXTENT)
+
+
+def _first_spaced(draws: jax.Array) -> jax.Array:
+    """[3, 2] the first of the draws that keeps the distances.
+
+    Each does with probability 0.31, or 0.23 if one cube must stand in the middle, so one of 64 always does.
+    """
+    gaps = jnp.linalg.norm(draws[:, [0, 0, 1]] - draws[:, [1, 2, 2]], axis=-1)
+    return draws[jnp.argmax(gaps.min(axis=-1) >= SPACING)]
 
 
 def _draw_colors(key: jax.Array, split: str) -> jax.Array:

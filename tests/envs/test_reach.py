@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from scipy.stats import ks_2samp
 
 import milx
 from milx.envs import reach
@@ -193,6 +194,29 @@ def test_a_redrawn_task_keeps_its_target_and_has_other_training_colours(env, tas
     # A cube keeps its colour with probability 1/1000.
     kept = (np.abs(colors - tasks["train"].object_color).max(axis=-1) < 1e-6).sum()
     assert kept < 12 + 4 * np.sqrt(12)
+
+
+def test_a_redrawn_scene_moves_only_the_distractors_to_where_reset_would_put_them(env, tasks):
+    task, target = tasks["train"], np.asarray(tasks["train"].target)
+    draws, keys = len(target), jax.random.split(jax.random.key(7), 3)
+    one = jax.jit(jax.vmap(env.reset))(jax.random.split(keys[0], draws), task)
+    episodes = jax.tree.map(lambda x: np.repeat(np.asarray(x)[:, None], 3, axis=1), one)
+    redrawn = jax.jit(jax.vmap(env.redraw_scene))(jax.random.split(keys[1], draws), task, episodes)
+    np.testing.assert_array_equal(redrawn.vector, episodes.vector)
+    position, before = np.asarray(redrawn.mocap_pos), np.asarray(episodes.mocap_pos)
+    np.testing.assert_array_equal(position[:, 1:], position[:, :-1])  # nothing moves during the episode
+    rows = np.arange(draws)
+    np.testing.assert_array_equal(position[rows, 0, target], before[rows, 0, target])
+    assert np.mean(np.any(position != before, axis=-1)) > 0.66, "two of three stand elsewhere"
+    fresh = np.asarray(jax.jit(jax.vmap(env.reset))(jax.random.split(keys[2], draws), task).mocap_pos)
+
+    def gaps(position):
+        return np.linalg.norm(position[:, [0, 0, 1], :2] - position[:, [1, 2, 2], :2], axis=-1)
+
+    assert gaps(position[:, 0]).min() >= 0.15
+    assert ks_2samp(gaps(position[:, 0])[:, 0], gaps(fresh)[:, 0]).pvalue > 1e-4
+    for cube in range(3):
+        assert_uniform(np.bincount((position[:, 0, cube, :2] > 0) @ [1, 2], minlength=4))
 
 
 def test_scenes_keep_their_distances_and_the_arm_starts_at_zero(env, task):
