@@ -87,7 +87,7 @@ class MILConfig:
         first_order: do not differentiate through the inner gradient.
         loss_scale: m; errors of the actions are multiplied by it before they are squared.
         whiten_actions: let the network predict actions with zero mean and unit variance.
-        goal_weight: weight of the goal head's squared error in both losses.
+        goal_weight: weight of the goal head's negative log likelihood in both losses.
     """
 
     inner_steps: int = 1
@@ -193,7 +193,7 @@ def _reach_fast() -> Config:
         network=NetworkConfig(
             strides=(2, 2, 1), soft_argmax=True, fc_layers=(200, 200), goal_head=True, mixed_precision=True
         ),
-        mil=MILConfig(inner_lr=0.03, learn_inner_lr=True, whiten_actions=True, goal_weight=10.0),
+        mil=MILConfig(inner_lr=0.03, learn_inner_lr=True, whiten_actions=True, goal_weight=1.0),
         optimizer=OptimizerConfig(warmup=0.05, cosine=True, clip_norm=1.0),
         train=TrainConfig(steps=36_000, meta_batch=64, support_frames=3, query_frames=3, redraw=True),
     )

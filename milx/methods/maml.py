@@ -110,7 +110,7 @@ class MIL(Method):
     def imitation_loss(
         self, theta: Params, whitening: Whitening, demo: Demo, inner: bool = False
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """Behavioural cloning (eq. 2) on demonstrations [K, T, ...], plus the goal head's error where there is one.
+        """Behavioural cloning (eq. 2) on demonstrations [K, T, ...], plus the goal head's where there is one.
 
         `inner` selects the head of the inner loss. Returns the sum and its parts.
         """
@@ -123,7 +123,8 @@ class MIL(Method):
         loss = action_loss = jnp.mean(jnp.square(error))
         metrics = {"action_loss": action_loss}
         if output.goal is not None:
-            goal = state[:, -1:, jnp.array(self.goal_indices)]
-            metrics["goal_loss"] = jnp.mean(jnp.square(output.goal.reshape(*state.shape[:2], -1) - goal))
+            end = state[:, -1, jnp.array(self.goal_indices)]
+            goal = jnp.repeat(end, state.shape[1], axis=0)
+            metrics["goal_loss"] = output.goal.negative_log_likelihood(goal).mean()
             loss += self.config.goal_weight * metrics["goal_loss"]
         return loss, metrics

@@ -94,6 +94,12 @@ def _four_places(kernel: jax.Array, stride: int, tile: int) -> jax.Array:
     return maps.reshape(4, step * step * channels, tile * tile * filters)
 
 
+def positions(height: int, width: int) -> jax.Array:
+    """[H W, 2]: x and y in [-1, 1] of every position of a feature map, row by row."""
+    y, x = jnp.meshgrid(jnp.linspace(-1, 1, height), jnp.linspace(-1, 1, width), indexing="ij")
+    return jnp.stack([x.ravel(), y.ravel()], axis=-1)
+
+
 def spatial_soft_argmax(features: jax.Array, temperature: jax.Array) -> jax.Array:
     """Expected image position of every channel (Levine et al. 2016, Section 5.1).
 
@@ -106,8 +112,7 @@ def spatial_soft_argmax(features: jax.Array, temperature: jax.Array) -> jax.Arra
     """
     height, width, channels = features.shape[1:]
     attention = jax.nn.softmax(features.reshape(-1, height * width, channels) / temperature, axis=1)
-    y, x = jnp.meshgrid(jnp.linspace(-1, 1, height), jnp.linspace(-1, 1, width), indexing="ij")
-    points = [jnp.einsum("bpc,p->bc", attention, axis.ravel()) for axis in (x, y)]
+    points = [jnp.einsum("bpc,p->bc", attention, axis) for axis in positions(height, width).T]
     return jnp.concatenate(points, axis=-1)
 
 

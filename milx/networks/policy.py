@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from milx.config import NetworkConfig
+from milx.networks.goal import Goal, GoalHead
 from milx.networks.layers import ConvBlock, Dense, spatial_soft_argmax
 from milx.types import Params
 
@@ -18,12 +19,12 @@ class PolicyOutput(NamedTuple):
     Attributes:
         action: [B, A] of the head that acts, in the network's units.
         inner_action: [B, A] of the head that the inner loss sees; the same head if there is only one.
-        goal: [B, G] where the episode will end; None without a goal head.
+        goal: where the episode will end; None without a goal head.
     """
 
     action: jax.Array
     inner_action: jax.Array
-    goal: jax.Array | None
+    goal: Goal | None
 
 
 class PolicyNetwork(NamedTuple):
@@ -51,6 +52,7 @@ class _Policy(nn.Module):
         for i, (filters, stride) in enumerate(zip(config.filters, config.strides, strict=True)):
             x = block(filters, config.kernel, stride, config.mixed_precision, name=f"ConvBlock_{i}")(x)
         x = x.astype(state.dtype)
+        goal = GoalHead(self.goal_size)(x) if config.goal_head else None
         if config.soft_argmax:
             x = spatial_soft_argmax(x, jnp.exp(self.param("log_temperature", nn.initializers.zeros, x.shape[-1:])))
         else:
@@ -60,10 +62,8 @@ class _Policy(nn.Module):
         # (the paper's bias transformation, Section 4.1).
         z = self.param("bias_transformation", nn.initializers.zeros, (config.bias_transformation,))
         parts = [x, state, jnp.broadcast_to(z, (len(x), *z.shape))]
-        goal = None
-        if config.goal_head:
-            goal = Dense(self.goal_size)(jnp.concatenate(parts, axis=-1))
-            parts.append(goal)
+        if goal is not None:
+            parts.append(goal.mean)
         x = jnp.concatenate(parts, axis=-1)
         for features in config.fc_layers:
             x = Dense(features, hidden=True, norm=config.fc_norm, init_std=config.fc_init_std)(x)

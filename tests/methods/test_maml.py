@@ -13,6 +13,7 @@ from milx import methods
 from milx.config import Config, MILConfig, NetworkConfig
 from milx.methods import maml
 from milx.methods.maml import MIL
+from milx.networks.goal import Goal
 from milx.networks.policy import PolicyNetwork, PolicyOutput, make_policy
 from milx.types import Demo, Observation, TaskBatch
 from milx.whitening import Whitening
@@ -229,7 +230,7 @@ def test_goal_head_predicts_the_last_state_of_each_demonstration(batch):
     network = PolicyNetwork(
         init=CONSTANT.init,
         apply=lambda theta, image, state: CONSTANT.apply(theta, image, state)._replace(
-            goal=jnp.broadcast_to(jnp.array([0.5, -2.0]), (len(state), 2))
+            goal=Goal(jnp.zeros((len(state), 1)), jnp.array([[0.5, -2.0]]), jnp.asarray(0.3))
         ),
     )
     method = MIL(MILConfig(goal_weight=0.7), network, GOAL_INDICES)
@@ -237,7 +238,8 @@ def test_goal_head_predicts_the_last_state_of_each_demonstration(batch):
     demo = jax.tree.map(lambda x: x[0], batch.query)
     loss, metrics = method.imitation_loss(jnp.asarray(THETA), whitening, demo)
     goals = np.asarray((demo.state - whitening.state_mean) / whitening.state_scale)[:, -1, list(GOAL_INDICES)]
-    expected = np.mean((np.array([0.5, -2.0]) - goals) ** 2)
+    square = np.mean(np.sum((np.array([0.5, -2.0]) - goals) ** 2, axis=-1))
+    expected = 0.5 * np.exp(-0.6) * square + np.log(2 * np.pi) + 2 * 0.3  # of one Gaussian in the plane
     np.testing.assert_allclose(metrics["goal_loss"], expected, rtol=1e-12)
     np.testing.assert_allclose(loss, metrics["action_loss"] + 0.7 * expected, rtol=1e-12)
 

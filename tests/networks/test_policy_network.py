@@ -79,11 +79,17 @@ def test_without_bias_transformation_nothing_of_it_is_left(inputs):
 def test_examples_of_a_batch_do_not_see_each_other(inputs, changes):
     """Layer norm, unlike batch norm, acts within an example: a batch is a loop over its examples."""
     network, params = build(**changes)
-    together = network.apply(params, *inputs)
+
+    def answer(*inputs):
+        output = network.apply(params, *inputs)
+        return (output.action, output.goal.log_weight) if output.goal else (output.action,)
+
+    together = answer(*inputs)
     for i in range(BATCH):
-        alone = network.apply(params, *(x[i : i + 1] for x in inputs))
+        alone = answer(*(x[i : i + 1] for x in inputs))
         jax.tree.map(lambda a, b, i=i: np.testing.assert_allclose(a[0], b[i], rtol=1e-9), alone, together)
-    assert np.abs(np.diff(together.action, axis=0)).min() > 1e-6
+    for parts in together:
+        assert np.abs(np.diff(parts, axis=0)).min() > 1e-6
 
 
 def test_one_head_answers_both_losses_and_two_heads_share_all_but_the_last_layer(inputs):
@@ -101,14 +107,13 @@ def test_one_head_answers_both_losses_and_two_heads_share_all_but_the_last_layer
 
 def test_the_prediction_of_the_goal_reaches_the_action(inputs):
     network, params = build(goal_head=True)
-    goal_layer = params["Dense_0"]
-    np.testing.assert_array_equal(goal_layer["bias"].shape, (GOAL,))
-    # Whatever the layer predicts is appended to the input of the next: a bias there acts through its rows.
+    head = params["GoalHead_0"]
+    # The expected goal is appended to the input of the first layer: a shift of all votes acts through its rows.
     shift = jnp.array([0.3, -0.7])
-    moved = {**params, "Dense_0": {**goal_layer, "bias": goal_layer["bias"] + shift}}
-    first = params["Dense_1"]
-    folded = {**params, "Dense_1": {**first, "bias": first["bias"] + shift @ first["kernel"][-GOAL:]}}
+    moved = {**params, "GoalHead_0": {**head, "vote": head["vote"].at[-1].add(shift)}}
+    first = params["Dense_0"]
+    folded = {**params, "Dense_0": {**first, "bias": first["bias"] + shift @ first["kernel"][-GOAL:]}}
     plain, moved, folded = (network.apply(p, *inputs) for p in (params, moved, folded))
-    np.testing.assert_allclose(moved.goal, plain.goal + shift, rtol=1e-12)
+    np.testing.assert_allclose(moved.goal.mean, plain.goal.mean + shift, rtol=1e-9)
     np.testing.assert_allclose(moved.action, folded.action, rtol=1e-9)
     assert np.abs(moved.action - plain.action).max() > 1e-3

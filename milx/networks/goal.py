@@ -1,0 +1,62 @@
+"""Where the demonstration went, read off the image: a mixture density over the positions of a feature map.
+
+Every position of the map votes for one goal, the same for all images: an affine function of where the position lies.
+A learned filter weighs the votes. The paper (Section 6.3) predicts such a point with a linear layer and the squared
+error, whose best blind guess is the mean of all candidates, which no candidate looks like. The best blind mixture finds
+the candidates; and the gradient of its likelihood in the filter is the feature where the demonstration went minus the
+mean feature of the candidates. So one inner step turns the filter towards what was shown.
+"""
+
+from typing import NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from milx.networks.layers import positions
+
+
+class Goal(NamedTuple):
+    """A mixture of isotropic Gaussians (Bishop 1994) over goals in R^G, in whitened units.
+
+    Attributes:
+        log_weight: [B, P] logarithms of the weights of the P positions.
+        vote: [P, G] their means.
+        log_std: scalar, logarithm of their common standard deviation.
+    """
+
+    log_weight: jax.Array
+    vote: jax.Array
+    log_std: jax.Array
+
+    @property
+    def mean(self) -> jax.Array:
+        """[B, G] the expected goal."""
+        return jnp.exp(self.log_weight) @ self.vote
+
+    def negative_log_likelihood(self, goal: jax.Array) -> jax.Array:
+        """[B] of goals [B, G]."""
+        size = self.vote.shape[-1]
+        square = jnp.square(goal[:, None] - self.vote).sum(axis=-1)
+        log_density = -0.5 * (square * jnp.exp(-2 * self.log_std) + size * jnp.log(2 * jnp.pi)) - size * self.log_std
+        return -jax.nn.logsumexp(self.log_weight + log_density, axis=-1)
+
+
+class GoalHead(nn.Module):
+    """Maps features [B, H, W, C] to a `Goal`.
+
+    Attributes:
+        size: G.
+    """
+
+    size: int
+
+    @nn.compact
+    def __call__(self, features: jax.Array) -> Goal:
+        """See the class."""
+        batch, height, width, channels = features.shape
+        kernel = self.param("kernel", nn.initializers.normal(channels**-0.5), (channels,))
+        heat = features.reshape(batch, height * width, channels) @ kernel
+        place = jnp.append(positions(height, width), jnp.ones((height * width, 1)), axis=-1)
+        vote = place @ self.param("vote", nn.initializers.zeros, (3, self.size))
+        return Goal(jax.nn.log_softmax(heat), vote, self.param("log_std", nn.initializers.zeros, ()))

@@ -1,0 +1,75 @@
+"""The goal's density against SciPy, and the law that makes one inner step find what was shown."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.special import softmax
+from scipy.stats import multivariate_normal
+
+from milx.networks.goal import Goal, GoalHead
+from milx.networks.layers import positions
+
+BATCH, HEIGHT, WIDTH, CHANNELS, GOAL = 5, 3, 4, 6, 2
+LOG_STD = -0.4
+
+
+@pytest.fixture(autouse=True, scope="module")
+def float64():
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(0)
+
+
+def likelihoods(weight, vote, goal):
+    """[B, P]: every position's share of the density of every goal, from SciPy."""
+    normal = [multivariate_normal(mean, np.exp(2 * LOG_STD)) for mean in vote]
+    return weight * np.stack([n.pdf(goal) for n in normal], axis=-1)
+
+
+def test_density_is_that_of_a_mixture_of_gaussians(rng):
+    heat, vote, goal = (rng.standard_normal(shape) for shape in ((BATCH, 7), (7, GOAL), (BATCH, GOAL)))
+    density = Goal(jax.nn.log_softmax(heat), jnp.asarray(vote), jnp.asarray(LOG_STD))
+    weight = softmax(heat, axis=-1)
+    expected = -np.log(likelihoods(weight, vote, goal).sum(axis=-1))
+    np.testing.assert_allclose(density.negative_log_likelihood(jnp.asarray(goal)), expected, rtol=1e-12)
+    np.testing.assert_allclose(density.mean, weight @ vote, rtol=1e-12)
+
+
+def test_gradient_in_the_filter_is_the_mean_feature_less_the_feature_where_the_goal_is(rng):
+    features, goal = rng.standard_normal((BATCH, HEIGHT, WIDTH, CHANNELS)), rng.standard_normal((BATCH, GOAL))
+    head = GoalHead(GOAL)
+    params = jax.tree.map(lambda x: jnp.asarray(rng.standard_normal(x.shape)), head.init(jax.random.key(0), features))
+    params["params"]["log_std"] = jnp.asarray(LOG_STD)
+
+    def loss(params):
+        return head.apply(params, features).negative_log_likelihood(jnp.asarray(goal)).sum()
+
+    gradient = jax.grad(loss)(params)["params"]["kernel"]
+    found = head.apply(params, features)
+    prior = np.exp(found.log_weight)
+    posterior = likelihoods(prior, np.asarray(found.vote), goal)
+    posterior /= posterior.sum(axis=-1, keepdims=True)
+    expected = np.einsum("bp,bpc->c", prior - posterior, features.reshape(BATCH, -1, CHANNELS))
+    np.testing.assert_allclose(gradient, expected, rtol=1e-10)
+    assert np.abs(expected).min() > 1e-2
+
+
+def test_votes_are_affine_in_the_position_and_the_weights_follow_the_features(rng):
+    head, spot = GoalHead(GOAL), (2, 1)
+    features = np.zeros((1, HEIGHT, WIDTH, CHANNELS))
+    features[0, *spot] = 1.0
+    params = {
+        "kernel": jnp.full(CHANNELS, 9.0),
+        "vote": jnp.asarray(rng.standard_normal((3, GOAL))),
+        "log_std": jnp.zeros(()),
+    }
+    found = head.apply({"params": params}, jnp.asarray(features))
+    x, y = 2 * spot[1] / (WIDTH - 1) - 1, 2 * spot[0] / (HEIGHT - 1) - 1
+    np.testing.assert_allclose(positions(HEIGHT, WIDTH)[spot[0] * WIDTH + spot[1]], [x, y], rtol=1e-12)
+    # e^54 against eleven positions without features.
+    np.testing.assert_allclose(found.mean[0], np.array([x, y, 1.0]) @ params["vote"], rtol=1e-12)
