@@ -58,7 +58,8 @@ class NetworkConfig:
         fc_init_std: standard deviation of their first weights; None for LeCun's initialisation.
         bias_transformation: size of the learned vector beside the first fully connected layer's input; 0 for none.
         heads: 1, or 2 for a separate output layer in the inner loss.
-        goal_head: predict where the episode ends, from the image, and show the prediction to the layers after it.
+        goal_head: predict where the episode ends, from the image, and show the prediction to the layers after it
+            (`milx.networks.goal`).
     """
 
     filters: tuple[int, ...] = (40, 40, 40)
@@ -87,7 +88,7 @@ class MILConfig:
         first_order: do not differentiate through the inner gradient.
         loss_scale: m; errors of the actions are multiplied by it before they are squared.
         whiten_actions: let the network predict actions with zero mean and unit variance.
-        goal_weight: weight of the goal head's negative log likelihood in both losses.
+        goal_weight: weight of the goal head's negative log likelihoods.
     """
 
     inner_steps: int = 1
@@ -207,7 +208,7 @@ def _reach_cpu() -> Config:
     config.network.filters = (32, 32, 32)
     config.network.fc_layers = (100, 100)
     config.train = TrainConfig(
-        steps=14_000, meta_batch=8, support_frames=6, query_frames=6, redraw=True, eval_every=3500
+        steps=14_000, meta_batch=8, support_frames=3, query_frames=3, redraw=True, eval_every=3500
     )
     config.optimizer.learning_rate, config.optimizer.warmup = 2e-3, 0.02
     config.evaluation.validation_tasks = 25

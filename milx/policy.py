@@ -20,7 +20,9 @@ from milx.whitening import Whitening
 def spec_of(env: envs.Env) -> Spec:
     """The sizes of what a policy sees and does in an environment."""
     low, high = (tuple(np.asarray(limit).tolist()) for limit in env.action_range)
-    return Spec(env.image_shape, env.state_size, env.action_size, (low, high), env.goal_indices)
+    calibration = env.image_to_goal
+    image_to_goal = None if calibration is None else tuple(tuple(row) for row in calibration.tolist())
+    return Spec(env.image_shape, env.state_size, env.action_size, (low, high), env.goal_indices, image_to_goal)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -13,6 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 from mujoco import mjx
 
 from milx.render.scene import Renderer
@@ -92,6 +93,24 @@ class Env(abc.ABC):
         """The lowest and highest action, [A] each; `step` clips to it."""
         low, high = self.mj_model.actuator_ctrlrange.T
         return jnp.asarray(low, float), jnp.asarray(high, float)
+
+    @property
+    def image_to_goal(self) -> np.ndarray | None:
+        """[3, G] from (x, y, 1), x and y in [-1, 1] across and down the image, to the goal; None if not known."""
+        return None
+
+    def image_to_plane(self, height: float) -> np.ndarray:
+        """[3, 2] from (x, y, 1) to the x and y (m) of what is seen there at this height: exact from straight above."""
+        data = mujoco.MjData(self.mj_model)
+        mujoco.mj_forward(self.mj_model, data)
+        camera = self.mj_model.camera(self.camera).id
+        tangent = np.tan(np.radians(self.mj_model.cam_fovy[camera]) / 2)
+        aspect = self.image_shape[1] / self.image_shape[0]
+        corner = np.array([[x, y, 1] for x in (-1, 1) for y in (-1, 1)])
+        ray = corner * [tangent * aspect, -tangent, -1] @ data.cam_xmat[camera].reshape(3, 3).T
+        origin = data.cam_xpos[camera]
+        seen = origin + ray * ((height - origin[2]) / ray[:, 2:])
+        return np.linalg.lstsq(corner, seen[:, :2], rcond=None)[0]
 
     @property
     @abc.abstractmethod

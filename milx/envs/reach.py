@@ -65,6 +65,11 @@ class Reach(Env):
         self._height = float(self.mj_model.body("target").pos[2])
         self._fingertip = self.mj_model.site("fingertip").id
 
+    @property
+    def image_to_goal(self) -> np.ndarray:
+        """The goal is the fingertip's place, at last over a cube."""
+        return self.image_to_plane(self._height)
+
     def sample_task(self, key: jax.Array, split: str) -> ReachTask:
         """Draws three different colours from the split's grid, and the target among them."""
         check_split(split)

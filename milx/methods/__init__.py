@@ -21,6 +21,8 @@ class Spec:
         action_size: A.
         action_range: lowest and highest entry of each action.
         goal_indices: entries of the state that tell, at the end of a demonstration, where it went.
+        image_to_goal: [3][G] affine map from (x, y, 1), x and y in [-1, 1] across and down the image, to those entries,
+            from the camera's calibration; None if that is not known.
     """
 
     image_shape: tuple[int, int]
@@ -28,13 +30,14 @@ class Spec:
     action_size: int
     action_range: tuple[tuple[float, ...], tuple[float, ...]]
     goal_indices: tuple[int, ...]
+    image_to_goal: tuple[tuple[float, ...], ...] | None = None
 
 
 def _make_mil(config: Config, spec: Spec) -> Method:
     network = make_policy(
         config.network, spec.image_shape, spec.state_size, spec.action_size, goal_size=len(spec.goal_indices)
     )
-    return MIL(config.mil, network, spec.goal_indices)
+    return MIL(config.mil, network, spec.goal_indices, spec.image_to_goal if config.network.goal_head else None)
 
 
 METHODS: dict[str, Callable[[Config, Spec], Method]] = {"mil": _make_mil}

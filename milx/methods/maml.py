@@ -19,6 +19,7 @@ import jax.numpy as jnp
 
 from milx.config import MILConfig
 from milx.methods.base import Method
+from milx.networks.goal import calibrate
 from milx.networks.policy import PolicyNetwork
 from milx.types import Demo, Memory, Observation, Params, TaskBatch
 from milx.whitening import Whitening
@@ -60,15 +61,23 @@ class MIL(Method):
         config: inner steps and losses.
         network: the policy network.
         goal_indices: entries of the state at a demonstration's last step that the goal head predicts.
+        image_to_goal: [3, G] from (x, y, 1), x and y in [-1, 1] across and down the image, to those entries, to start
+            the goal head from; None without one, or if it must learn that by itself.
     """
 
     config: MILConfig
     network: PolicyNetwork
     goal_indices: tuple[int, ...] = ()
+    image_to_goal: tuple[tuple[float, ...], ...] | None = None
 
     def init(self, key: jax.Array, whitening: Whitening) -> Params:
         """Draws the network's parameters."""
-        params = {"policy": self.network.init(key), "whitening": whitening}
+        theta = self.network.init(key)
+        if self.image_to_goal is not None:
+            indices = jnp.array(self.goal_indices)
+            votes = jnp.array(self.image_to_goal).at[-1].add(-whitening.state_mean[indices])
+            theta["goal_head"] = calibrate(theta["goal_head"], votes / whitening.state_scale[indices])
+        params = {"policy": theta, "whitening": whitening}
         if self.config.learn_inner_lr:
             params["inner_log_lr"] = jax.tree.map(lambda _: jnp.zeros(()), params["policy"])
         return params
@@ -110,7 +119,7 @@ class MIL(Method):
     def imitation_loss(
         self, theta: Params, whitening: Whitening, demo: Demo, inner: bool = False
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """Behavioural cloning (eq. 2) on demonstrations [K, T, ...], plus the goal head's where there is one.
+        """Behavioural cloning (eq. 2) on demonstrations [K, T, ...], plus the goal head's error where there is one.
 
         `inner` selects the head of the inner loss. Returns the sum and its parts.
         """

@@ -5,6 +5,9 @@ A learned filter weighs the votes. The paper (Section 6.3) predicts such a point
 error, whose best blind guess is the mean of all candidates, which no candidate looks like. The best blind mixture finds
 the candidates; and the gradient of its likelihood in the filter is the feature where the demonstration went minus the
 mean feature of the candidates. So one inner step turns the filter towards what was shown.
+
+All this waits until the votes are about right: from zero, some seeds find them in 1,000 updates, others never. So they
+start from the camera's calibration where it is known (`calibrate`), and are learned from there on.
 """
 
 from typing import NamedTuple
@@ -14,6 +17,7 @@ import jax
 import jax.numpy as jnp
 
 from milx.networks.layers import positions
+from milx.types import Params
 
 
 class Goal(NamedTuple):
@@ -57,6 +61,18 @@ class GoalHead(nn.Module):
         batch, height, width, channels = features.shape
         kernel = self.param("kernel", nn.initializers.normal(channels**-0.5), (channels,))
         heat = features.reshape(batch, height * width, channels) @ kernel
-        place = jnp.append(positions(height, width), jnp.ones((height * width, 1)), axis=-1)
+        # The image reaches from -1 to 1: half a cell beyond the centres of the outermost.
+        centre = positions(height, width) * (1 - 1 / jnp.array([width, height]))
+        place = jnp.append(centre, jnp.ones((height * width, 1)), axis=-1)
         vote = place @ self.param("vote", nn.initializers.zeros, (3, self.size))
         return Goal(jax.nn.log_softmax(heat), vote, self.param("log_std", nn.initializers.zeros, ()))
+
+
+def calibrate(params: Params, image_to_goal: jax.Array) -> Params:
+    """The parameters of a `GoalHead`, with votes from the camera's calibration.
+
+    Args:
+        params: the head's parameters.
+        image_to_goal: [3, G], takes (x, y, 1) with x and y in [-1, 1] across and down the image to a whitened goal.
+    """
+    return {**params, "vote": image_to_goal}

@@ -52,7 +52,7 @@ class _Policy(nn.Module):
         for i, (filters, stride) in enumerate(zip(config.filters, config.strides, strict=True)):
             x = block(filters, config.kernel, stride, config.mixed_precision, name=f"ConvBlock_{i}")(x)
         x = x.astype(state.dtype)
-        goal = GoalHead(self.goal_size)(x) if config.goal_head else None
+        goal = GoalHead(self.goal_size, name="goal_head")(x) if config.goal_head else None
         if config.soft_argmax:
             x = spatial_soft_argmax(x, jnp.exp(self.param("log_temperature", nn.initializers.zeros, x.shape[-1:])))
         else:

@@ -219,6 +219,22 @@ def test_a_redrawn_scene_moves_only_the_distractors_to_where_reset_would_put_the
         assert_uniform(np.bincount((position[:, 0, cube, :2] > 0) @ [1, 2], minlength=4))
 
 
+def test_calibration_tells_where_in_the_image_a_cube_stands(env):
+    """The cube's pixels, found by drawing it in another colour, have their centre where the calibration puts it."""
+    spots = np.random.default_rng(0).uniform(-0.19, 0.19, (6, 2))
+    image_to_goal = env.image_to_goal
+    for spot in spots:
+        position = np.array([[*spot, 0.03], [0.5, 0.5, 0.03], [0.5, -0.5, 0.03]])
+        state = State(jnp.array([np.pi, 0.0]), jnp.zeros(2), jnp.asarray(position))
+        task = [reach.ReachTask(jnp.full((3, 3), level).at[1:].set(0.5), jnp.asarray(0)) for level in (0.1, 0.9)]
+        dark, light = (np.asarray(env.observe(t, state).image, int) for t in task)
+        rows, cols = np.nonzero(np.abs(light - dark).max(axis=-1) > 60)
+        height, width = env.image_shape
+        centre = np.array([(2 * cols.mean() + 1) / width - 1, (2 * rows.mean() + 1) / height - 1, 1.0])
+        # Half a pixel is 4 mm; a cube of 6 cm, seen from 1.2 m, shows a little of its sides.
+        np.testing.assert_allclose(centre @ image_to_goal, spot, atol=0.008)
+
+
 def test_scenes_keep_their_distances_and_the_arm_starts_at_zero(env, task):
     draws = 20_000
     scenes = jax.jit(jax.vmap(env.reset, in_axes=(0, None)))(jax.random.split(jax.random.key(3), draws), task)

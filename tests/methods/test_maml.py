@@ -244,6 +244,17 @@ def test_goal_head_predicts_the_last_state_of_each_demonstration(batch):
     np.testing.assert_allclose(loss, metrics["action_loss"] + 0.7 * expected, rtol=1e-12)
 
 
+def test_votes_start_from_the_cameras_calibration_in_whitened_units():
+    network, _ = random_params(goal_head=True)
+    whitening, corner = random_whitening(np.random.default_rng(4)), np.array([0.3, -0.6, 1.0])
+    image_to_goal = ((0.4, 0.0), (0.1, -0.2), (0.3, 0.5))
+    method = MIL(MILConfig(), network, GOAL_INDICES, image_to_goal)
+    votes = corner @ np.asarray(method.init(jax.random.key(0), whitening)["policy"]["goal_head"]["vote"])
+    state = np.zeros(STATE)
+    state[list(GOAL_INDICES)] = corner @ np.array(image_to_goal)
+    np.testing.assert_allclose(votes, np.asarray(whitening.state(state))[list(GOAL_INDICES)], rtol=1e-6)
+
+
 # Laws of the inner step.
 
 

@@ -71,5 +71,6 @@ def test_votes_are_affine_in_the_position_and_the_weights_follow_the_features(rn
     found = head.apply({"params": params}, jnp.asarray(features))
     x, y = 2 * spot[1] / (WIDTH - 1) - 1, 2 * spot[0] / (HEIGHT - 1) - 1
     np.testing.assert_allclose(positions(HEIGHT, WIDTH)[spot[0] * WIDTH + spot[1]], [x, y], rtol=1e-12)
+    x, y = (2 * spot[1] + 1) / WIDTH - 1, (2 * spot[0] + 1) / HEIGHT - 1  # the cell's centre in the image
     # e^54 against eleven positions without features.
     np.testing.assert_allclose(found.mean[0], np.array([x, y, 1.0]) @ params["vote"], rtol=1e-12)

@@ -107,10 +107,10 @@ def test_one_head_answers_both_losses_and_two_heads_share_all_but_the_last_layer
 
 def test_the_prediction_of_the_goal_reaches_the_action(inputs):
     network, params = build(goal_head=True)
-    head = params["GoalHead_0"]
+    head = params["goal_head"]
     # The expected goal is appended to the input of the first layer: a shift of all votes acts through its rows.
     shift = jnp.array([0.3, -0.7])
-    moved = {**params, "GoalHead_0": {**head, "vote": head["vote"].at[-1].add(shift)}}
+    moved = {**params, "goal_head": {**head, "vote": head["vote"].at[-1].add(shift)}}
     first = params["Dense_0"]
     folded = {**params, "Dense_0": {**first, "bias": first["bias"] + shift @ first["kernel"][-GOAL:]}}
     plain, moved, folded = (network.apply(p, *inputs) for p in (params, moved, folded))
