@@ -6,8 +6,8 @@ error, whose best blind guess is the mean of all candidates, which no candidate 
 the candidates; and the gradient of its likelihood in the filter is the feature where the demonstration went minus the
 mean feature of the candidates. So one inner step turns the filter towards what was shown.
 
-All this waits until the votes are about right: from zero, some seeds find them in 1,000 updates, others never. So they
-start from the camera's calibration where it is known (`calibrate`), and are learned from there on.
+All this waits until the votes are about right: from zero, one seed found them within 1,000 updates, another not within
+2,000. So they start from the camera's calibration where it is known (`calibrate`), and are learned from there on.
 """
 
 from typing import NamedTuple
