@@ -3,7 +3,6 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from scipy.special import softmax
 from scipy.stats import multivariate_normal
 
@@ -12,17 +11,6 @@ from milx.networks.layers import positions
 
 BATCH, HEIGHT, WIDTH, CHANNELS, GOAL = 5, 3, 4, 6, 2
 LOG_STD = -0.4
-
-
-@pytest.fixture(autouse=True, scope="module")
-def float64():
-    with jax.enable_x64(True):
-        yield
-
-
-@pytest.fixture
-def rng():
-    return np.random.default_rng(0)
 
 
 def likelihoods(weight, vote, goal):

@@ -9,18 +9,6 @@ import pytest
 
 from milx.networks import layers
 
-
-@pytest.fixture(autouse=True, scope="module")
-def float64():
-    with jax.enable_x64(True):
-        yield
-
-
-@pytest.fixture
-def rng():
-    return np.random.default_rng(0)
-
-
 # Convolution.
 
 

@@ -12,12 +12,6 @@ IMAGE_SHAPE, STATE, ACTION, GOAL, BATCH = (8, 10), 3, 2, 2, 6
 TINY = {"filters": (4, 4), "strides": (2, 2), "fc_layers": (8,), "bias_transformation": 5}
 
 
-@pytest.fixture(autouse=True, scope="module")
-def float64():
-    with jax.enable_x64(True):
-        yield
-
-
 @pytest.fixture(scope="module")
 def inputs():
     rng = np.random.default_rng(0)
