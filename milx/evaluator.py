@@ -32,6 +32,7 @@ def wilson_interval(successes: int, trials: int, z: float = 1.959964) -> tuple[f
     return max(min(centre - half, rate), 0.0), min(max(centre + half, rate), 1.0)
 
 
+@functools.partial(jax.jit, static_argnums=(0, 3))
 def trial_scenes(env: Env, task: Task, key: jax.Array, trials: int) -> State:
     """Draws the scenes of every task's trials: `task` has a leading axis [N], the result [N, trials]."""
     num_tasks = len(jax.tree.leaves(task)[0])
