@@ -40,9 +40,12 @@ def convolve_patches(x: jax.Array, kernel: jax.Array, stride: int) -> jax.Array:
     rows, cols = ((-(-size // stride) - 1) * stride + 1 for size in (height, width))
     shifted = [x[:, i : i + rows : stride, j : j + cols : stride] for i in range(taps) for j in range(taps)]
     patches = jnp.concatenate(shifted, axis=-1)
-    # As a plain matrix: with four axes XLA copies the output's gradient into another order, slowly.
-    y = patches.reshape(-1, patches.shape[-1]) @ kernel.reshape(-1, filters)
-    return y.reshape(*patches.shape[:3], filters)
+    return _product(patches, kernel.reshape(-1, filters))
+
+
+def _product(x: jax.Array, weights: jax.Array) -> jax.Array:
+    """[.., K] times [K, F] as plain matrices: with more axes XLA copies the output's gradient into another order."""
+    return (x.reshape(-1, x.shape[-1]) @ weights).reshape(*x.shape[:-1], -1)
 
 
 def convolve_blocks(x: jax.Array, kernel: jax.Array, stride: int) -> jax.Array:
@@ -69,9 +72,9 @@ def convolve_blocks(x: jax.Array, kernel: jax.Array, stride: int) -> jax.Array:
     places = [(i, j) for i in range(2) for j in range(2)]
     if step * step * channels < tile * tile * filters:
         neighbours = [blocks[:, i : i + rows, j : j + cols] for i, j in places]
-        y = jnp.concatenate(neighbours, axis=-1) @ weights.reshape(-1, tile * tile * filters)
+        y = _product(jnp.concatenate(neighbours, axis=-1), weights.reshape(-1, tile * tile * filters))
     else:
-        products = jnp.split(blocks @ jnp.concatenate(list(weights), axis=-1), len(places), axis=-1)
+        products = jnp.split(_product(blocks, jnp.concatenate(list(weights), axis=-1)), len(places), axis=-1)
         shifted = [z[:, i : i + rows, j : j + cols] for z, (i, j) in zip(products, places, strict=True)]
         y = functools.reduce(jnp.add, shifted)
 
