@@ -66,8 +66,8 @@ def floor_ms(config: Config, env: Env, tasks: int, frames: int) -> tuple[float, 
     a = jax.random.normal(jax.random.key(0), (n, n), jnp.bfloat16)
     product = jax.jit(lambda a: a @ a)
     operations_per_s = 2 * n**3 / (1e-3 * common.median_ms(product, a, repeats=10))
-    copied = jnp.zeros((2**30,), jnp.int8)
-    bytes_per_s = 2 * copied.size / (1e-3 * common.median_ms(jax.jit(lambda x: x + 1), copied, repeats=10))
+    copied = jnp.zeros(2**28)
+    bytes_per_s = 2 * copied.nbytes / (1e-3 * common.median_ms(jax.jit(lambda x: x + 1), copied, repeats=10))
 
     operations = traffic = 0.0
     (height, width), channels = env.image_shape, 3
