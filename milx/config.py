@@ -60,6 +60,7 @@ class NetworkConfig:
         heads: 1, or 2 for a separate output layer in the inner loss.
         goal_head: predict where the episode ends, from the image, and show the prediction to the layers after it
             (`milx.networks.goal`).
+        context: size of the vector that methods without adaptation keep of a demonstration: units of the LSTM.
     """
 
     filters: tuple[int, ...] = (40, 40, 40)
@@ -74,6 +75,7 @@ class NetworkConfig:
     bias_transformation: int = 10
     heads: int = 1
     goal_head: bool = False
+    context: int = 512
 
 
 @dataclasses.dataclass
@@ -206,9 +208,9 @@ def _reach_cpu() -> Config:
     config.data = DataConfig(tasks=300, demos_per_task=5, plan_iterations=8, plan_batch=100)
     config.network.mixed_precision = False
     config.network.filters = (32, 32, 32)
-    config.network.fc_layers = (100, 100)
+    config.network.fc_layers = (100, 100, 100)
     config.train = TrainConfig(
-        steps=14_000, meta_batch=8, support_frames=3, query_frames=3, redraw=True, eval_every=3500
+        steps=10_000, meta_batch=8, support_frames=3, query_frames=8, redraw=True, eval_every=2500
     )
     config.optimizer.learning_rate, config.optimizer.warmup = 2e-3, 0.02
     config.evaluation.validation_tasks = 25
@@ -217,10 +219,36 @@ def _reach_cpu() -> Config:
     return config
 
 
+def _reach_state_fast() -> Config:
+    config = _without_pixels(_reach_fast())
+    config.network.fc_layers = (200, 200, 200)
+    config.train.steps = 20_000
+    return config
+
+
+def _reach_state_cpu() -> Config:
+    config = _without_pixels(_reach_cpu())
+    config.train.meta_batch = 32
+    return config
+
+
+def _without_pixels(config: Config) -> Config:
+    """Neither convolutions nor goal head, but all time steps, which cost little now."""
+    network = config.network
+    network.filters = network.strides = ()
+    network.soft_argmax = network.goal_head = network.mixed_precision = False
+    config.train.support_frames = config.train.query_frames = None
+    return config
+
+
 PRESETS: dict[str, dict[str, Callable[[], Config]]] = {
     "reach": {"paper": _reach_paper, "fast": _reach_fast, "cpu": _reach_cpu},
+    "reach_state": {"fast": _reach_state_fast, "cpu": _reach_state_cpu},
 }
 """Preset factories by environment and name."""
+
+SUPPORT_FRAMES = {"contextual": 1, "lstm": None, "lstm_attention": None}
+"""Time steps of a demonstration that methods see which do not imitate it: the last one, or all as at test."""
 
 
 def make_config(env: str, method: str = "mil", preset: str = "fast", seed: int = 0) -> Config:
@@ -235,6 +263,7 @@ def make_config(env: str, method: str = "mil", preset: str = "fast", seed: int =
         raise ValueError(f"preset: got {preset!r}, expected one of {', '.join(PRESETS[env])}")
     config = PRESETS[env][preset]()
     config.env_name, config.method_name, config.preset, config.seed = env, method, preset, seed
+    config.train.support_frames = SUPPORT_FRAMES.get(method, config.train.support_frames)
     return config
 
 

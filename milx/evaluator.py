@@ -129,8 +129,7 @@ def film(camera: Env, task: Task, states: State) -> jax.Array:
 
     `camera` is the environment with the wanted image size.
     """
-    observe = jax.vmap(jax.vmap(camera.observe, in_axes=(None, 0)))
-    return observe(task, states).image
+    return jax.vmap(jax.vmap(camera.render, in_axes=(None, 0)))(task, states)
 
 
 def summary(success: jax.Array) -> dict[str, Any]:

@@ -22,7 +22,9 @@ def spec_of(env: envs.Env) -> Spec:
     low, high = (tuple(np.asarray(limit).tolist()) for limit in env.action_range)
     calibration = env.image_to_goal
     image_to_goal = None if calibration is None else tuple(tuple(row) for row in calibration.tolist())
-    return Spec(env.image_shape, env.state_size, env.action_size, (low, high), env.goal_indices, image_to_goal)
+    image_shape = env.image_shape if env.vision else None
+    sizes = image_shape, env.state_size, env.action_size
+    return Spec(*sizes, (low, high), env.goal_indices, image_to_goal, env.object_indices)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -122,7 +124,7 @@ def check_demo(demo: Demo, spec: Spec) -> Demo:
         raise ValueError(f"demo.action: got shape {list(action.shape)}, expected {expected}")
     shape = action.shape[: lead + 1]
     checked = Demo(
-        image=_check_image("demo.image", demo.image, (*shape, *spec.image_shape, 3)),
+        image=_check_image("demo.image", demo.image, shape, spec),
         state=_check_vector("demo.state", demo.state, (*shape, spec.state_size)),
         action=_check_vector("demo.action", action, (*shape, spec.action_size)),
     )
@@ -143,7 +145,7 @@ def check_observation(observation: Observation, spec: Spec) -> Observation:
     if not isinstance(observation, Observation):
         raise ValueError(f"observation: got {type(observation).__name__}, expected a milx.Observation")
     return Observation(
-        image=_check_image("observation.image", observation.image, (*spec.image_shape, 3)),
+        image=_check_image("observation.image", observation.image, (), spec),
         state=_check_vector("observation.state", observation.state, (spec.state_size,)),
     )
 
@@ -157,8 +159,12 @@ def _as_array(field: str, value: Any) -> Any:
         raise ValueError(f"{field}: got {type(value).__name__}, expected an array ({error})") from error
 
 
-def _check_image(field: str, value: Any, shape: tuple[int, ...]) -> jax.Array | np.ndarray:
-    array = _check_shape(field, value, shape)
+def _check_image(field: str, value: Any, lead: tuple[int, ...], spec: Spec) -> jax.Array | np.ndarray | None:
+    if spec.image_shape is None:
+        if value is not None:
+            raise ValueError(f"{field}: got {type(value).__name__}, expected None: this policy sees no pixels")
+        return None
+    array = _check_shape(field, value, (*lead, *spec.image_shape, 3))
     if array.dtype != np.uint8:
         raise ValueError(f"{field}: got {array.dtype}, expected uint8 in [0, 255]")
     return array

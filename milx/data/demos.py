@@ -1,6 +1,7 @@
 """Simulated demonstrations: states, actions and tasks on the device; pixels are rendered when they are needed."""
 
 import dataclasses
+import functools
 import hashlib
 import json
 import os
@@ -60,23 +61,27 @@ def collect(env: Env, key: jax.Array, split: str, num_tasks: int, num_demos: int
         num_demos: D.
         config: noise on the actions, and settings of the planner.
     """
-    key = jax.random.fold_in(key, SPLITS.index(split))
+    tasks, *inputs = _draw(env, jax.random.fold_in(key, SPLITS.index(split)), split, num_tasks, num_demos)
+    options = Options(iterations=config.plan_iterations)
+    states, action = map_in_chunks(
+        lambda *chunk: perform(env, *chunk, options, config.noise), tuple(inputs), config.plan_batch
+    )
+    success = jax.jit(jax.vmap(env.success))(inputs[0], states)
+    states, action, success = jax.tree.map(
+        lambda x: x.reshape(num_tasks, num_demos, *x.shape[1:]), (states, action, success)
+    )
+    return DemoSet(tasks, states, action, success)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 2, 3, 4))
+def _draw(env: Env, key: jax.Array, split: str, num_tasks: int, num_demos: int) -> tuple[Task, Task, State, jax.Array]:
+    """Tasks [N]; then, for each of the N D demonstrations, its task, the scene it starts from and a key for noise."""
     task_key, scene_key, noise_key = jax.random.split(key, 3)
     total = num_tasks * num_demos
     tasks = jax.vmap(env.sample_task, in_axes=(0, None))(jax.random.split(task_key, num_tasks), split)
     each = jax.tree.map(lambda x: jnp.repeat(x, num_demos, axis=0), tasks)
     state = jax.vmap(env.reset)(jax.random.split(scene_key, total), each)
-    inputs = (each, state, jax.random.split(noise_key, total))
-
-    options = Options(iterations=config.plan_iterations)
-    states, action = map_in_chunks(
-        lambda *chunk: perform(env, *chunk, options, config.noise), inputs, config.plan_batch
-    )
-    success = jax.jit(jax.vmap(env.success))(each, states)
-    states, action, success = jax.tree.map(
-        lambda x: x.reshape(num_tasks, num_demos, *x.shape[1:]), (states, action, success)
-    )
-    return DemoSet(tasks, states, action, success)
+    return tasks, each, state, jax.random.split(noise_key, total)
 
 
 def frame_indices(key: jax.Array, length: int, count: int | None) -> jax.Array:
@@ -86,7 +91,7 @@ def frame_indices(key: jax.Array, length: int, count: int | None) -> jax.Array:
     """
     if count is None or count >= length:
         return jnp.arange(length)
-    edges = jnp.arange(count) * (length - 1) // (count - 1)
+    edges = jnp.arange(count) * (length - 1) // max(count - 1, 1)
     offset = jax.random.uniform(key, (count - 1,)) * jnp.diff(edges)
     return jnp.append(edges[:-1] + offset.astype(jnp.int32), length - 1)
 

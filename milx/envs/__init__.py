@@ -1,9 +1,9 @@
 """Environments by name."""
 
 from milx.envs.base import SPLITS, Env, State, Task
-from milx.envs.reach import Reach
+from milx.envs.reach import Reach, ReachState
 
-ENVS: dict[str, type[Env]] = {Reach.name: Reach}
+ENVS: dict[str, type[Env]] = {env.name: env for env in (Reach, ReachState)}
 
 __all__ = ["ENVS", "SPLITS", "Env", "State", "Task", "make"]
 

@@ -64,6 +64,8 @@ class Env(abc.ABC):
         camera: the MJCF camera that the policy sees through.
         criterion: what counts as success, in words, for result files.
         goal_indices: entries of the robot's state that tell, at the end of a demonstration, where it went.
+        vision: whether the policy sees the image; if not, the state tells it where the objects are.
+        object_indices: [O][2] entries of the state with each object's place, where the state tells them.
     """
 
     name: str
@@ -73,6 +75,8 @@ class Env(abc.ABC):
     camera: str
     criterion: str
     goal_indices: tuple[int, ...]
+    vision: bool = True
+    object_indices: tuple[tuple[int, ...], ...] = ()
 
     def __init__(self, model: mujoco.MjModel, image_shape: tuple[int, int] | None = None):
         self.mj_model = model
@@ -138,7 +142,7 @@ class Env(abc.ABC):
 
     @abc.abstractmethod
     def robot_state(self, state: State) -> jax.Array:
-        """[S] what the robot knows of itself (units in the subclass)."""
+        """[S] what the robot knows of itself, and of the objects where there is no image (units in the subclass)."""
 
     @abc.abstractmethod
     def colors(self, task: Task) -> jax.Array:
@@ -182,11 +186,17 @@ class Env(abc.ABC):
 
     @functools.partial(jax.jit, static_argnums=0)
     def observe(self, task: Task, state: State) -> Observation:
-        """Renders the task's scene: image [H, W, 3] uint8 and robot state [S]."""
+        """What the policy sees: image [H, W, 3] uint8, None without vision, and state [S]."""
+        image = self.render(task, state) if self.vision else None
+        return Observation(image=image, state=self.robot_state(state))
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def render(self, task: Task, state: State) -> jax.Array:
+        """The camera's image [H, W, 3] uint8 of the task's scene."""
         data = mjx.kinematics(self.model, self.data(state))
         data = mjx.camlight(self.model, mjx.com_pos(self.model, data))
         scene = dataclasses.replace(self.renderer.scene(data), geom_rgba=self.colors(task))
-        return Observation(image=self.renderer.pixels(scene), state=self.robot_state(state))
+        return self.renderer.pixels(scene)
 
 
 def check_split(split: str) -> None:

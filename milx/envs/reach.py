@@ -1,4 +1,4 @@
-"""Vision reach: a planar two-joint arm goes to the cube of the demonstrated colour (paper, Section 6.1)."""
+"""Reach: a planar two-joint arm goes to one of three cubes, known by its colour or its number (paper, Section 6.1)."""
 
 import dataclasses
 import functools
@@ -165,3 +165,20 @@ def _draw_colors(key: jax.Array, split: str) -> jax.Array:
     index = jax.random.choice(key, 1000, (NUM_OBJECTS,), replace=False)
     grid = jnp.stack([index // 100, index // 10 % 10, index % 10], axis=-1).astype(float)
     return grid * 0.1 + COLOR_OFFSETS[split]
+
+
+class ReachState(Reach):
+    """Reach without a camera: the state also tells where the three cubes stand, in the task's order.
+
+    The state is 14-dimensional: the 8 entries of `Reach`, then x and y (m) of each cube. The target is the same one of
+    the three in all scenes of a task, and any of them in another task: only a demonstration tells which.
+    """
+
+    name = "reach_state"
+    state_size = 14
+    vision = False
+    object_indices = ((8, 9), (10, 11), (12, 13))
+
+    def robot_state(self, state: State) -> jax.Array:
+        """[14] the robot's 8, then the cubes' x and y."""
+        return jnp.concatenate([super().robot_state(state), state.mocap_pos[:, :2].ravel()])

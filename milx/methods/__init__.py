@@ -2,10 +2,14 @@
 
 import dataclasses
 from collections.abc import Callable
+from typing import Any
 
 from milx.config import Config
 from milx.methods.base import Method
+from milx.methods.context import ContextPolicy
 from milx.methods.maml import MIL
+from milx.networks.attention import AttentiveActor, ObjectTokens
+from milx.networks.context import Actor, LastFrame, Recurrent, make_context_network
 from milx.networks.policy import make_policy
 
 __all__ = ["METHODS", "Method", "Spec", "make"]
@@ -16,31 +20,65 @@ class Spec:
     """The sizes of what a policy sees and does.
 
     Attributes:
-        image_shape: (H, W).
+        image_shape: (H, W); None where the policy sees no pixels.
         state_size: S.
         action_size: A.
         action_range: lowest and highest entry of each action.
         goal_indices: entries of the state that tell, at the end of a demonstration, where it went.
         image_to_goal: [3][G] affine map from (x, y, 1), x and y in [-1, 1] across and down the image, to those entries,
             from the camera's calibration; None if that is not known.
+        object_indices: [O][2] entries of the state with each object's place, where the state tells them.
     """
 
-    image_shape: tuple[int, int]
+    image_shape: tuple[int, int] | None
     state_size: int
     action_size: int
     action_range: tuple[tuple[float, ...], tuple[float, ...]]
     goal_indices: tuple[int, ...]
     image_to_goal: tuple[tuple[float, ...], ...] | None = None
+    object_indices: tuple[tuple[int, ...], ...] = ()
 
 
 def _make_mil(config: Config, spec: Spec) -> Method:
     network = make_policy(
         config.network, spec.image_shape, spec.state_size, spec.action_size, goal_size=len(spec.goal_indices)
     )
-    return MIL(config.mil, network, spec.goal_indices, spec.image_to_goal if config.network.goal_head else None)
+    return MIL(config.mil, network, spec.goal_indices, _calibration(config, spec))
 
 
-METHODS: dict[str, Callable[[Config, Spec], Method]] = {"mil": _make_mil}
+def _make_contextual(config: Config, spec: Spec) -> Method:
+    return _with_context(config, spec, LastFrame(config.network))
+
+
+def _make_lstm(config: Config, spec: Spec) -> Method:
+    return _with_context(config, spec, Recurrent(config.network))
+
+
+def _make_lstm_attention(config: Config, spec: Spec) -> Method:
+    if not spec.object_indices or spec.image_shape is not None:
+        raise ValueError(
+            "method: got 'lstm_attention' where policies see pixels, expected a state that tells the objects"
+        )
+    actor = AttentiveActor(config.network, spec.action_size, spec.object_indices)
+    return _with_context(config, spec, ObjectTokens(config.network, spec.object_indices), actor)
+
+
+def _with_context(config: Config, spec: Spec, encoder: Any, actor: Any = None) -> Method:
+    actor = actor or Actor(config.network, spec.action_size, goal_size=len(spec.goal_indices))
+    network = make_context_network(encoder, actor, spec.image_shape, spec.state_size, spec.action_size)
+    return ContextPolicy(config.mil, network, spec.goal_indices, _calibration(config, spec))
+
+
+def _calibration(config: Config, spec: Spec) -> tuple[tuple[float, ...], ...] | None:
+    return spec.image_to_goal if config.network.goal_head else None
+
+
+METHODS: dict[str, Callable[[Config, Spec], Method]] = {
+    "mil": _make_mil,
+    "contextual": _make_contextual,
+    "lstm": _make_lstm,
+    "lstm_attention": _make_lstm_attention,
+}
 
 
 def make(config: Config, spec: Spec) -> Method:

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 
 from milx.config import MILConfig
 from milx.methods.base import Method
-from milx.networks.goal import calibrate
+from milx.methods.imitation import behavioural_cloning, calibrate_goal_head
 from milx.networks.policy import PolicyNetwork
 from milx.types import Demo, Memory, Observation, Params, TaskBatch
 from milx.whitening import Whitening
@@ -73,10 +73,7 @@ class MIL(Method):
     def init(self, key: jax.Array, whitening: Whitening) -> Params:
         """Draws the network's parameters."""
         theta = self.network.init(key)
-        if self.image_to_goal is not None:
-            indices = jnp.array(self.goal_indices)
-            votes = jnp.array(self.image_to_goal).at[-1].add(-whitening.state_mean[indices])
-            theta["goal_head"] = calibrate(theta["goal_head"], votes / whitening.state_scale[indices])
+        theta = calibrate_goal_head(theta, self.image_to_goal, self.goal_indices, whitening)
         params = {"policy": theta, "whitening": whitening}
         if self.config.learn_inner_lr:
             params["inner_log_lr"] = jax.tree.map(lambda _: jnp.zeros(()), params["policy"])
@@ -110,7 +107,8 @@ class MIL(Method):
         """The adapted network's action for one observation."""
         whitening = task_params["whitening"]
         state = whitening.state(observation.state)
-        output = self.network.apply(task_params["policy"], observation.image[None], state[None])
+        image = None if observation.image is None else observation.image[None]
+        output = self.network.apply(task_params["policy"], image, state[None])
         return whitening.unwhiten_action(output.action[0]), memory
 
     def _inner_loss(self, theta: Params, whitening: Whitening, demo: Demo) -> jax.Array:
@@ -125,15 +123,6 @@ class MIL(Method):
         """
         whitening = jax.lax.stop_gradient(whitening)
         flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), demo)
-        state = whitening.state(demo.state)
-        output = self.network.apply(theta, flat.image, state.reshape(-1, state.shape[-1]))
+        output = self.network.apply(theta, flat.image, whitening.state(flat.state))
         action = output.inner_action if inner else output.action
-        error = self.config.loss_scale * (action - whitening.action(flat.action))
-        loss = action_loss = jnp.mean(jnp.square(error))
-        metrics = {"action_loss": action_loss}
-        if output.goal is not None:
-            end = state[:, -1, jnp.array(self.goal_indices)]
-            goal = jnp.repeat(end, state.shape[1], axis=0)
-            metrics["goal_loss"] = output.goal.negative_log_likelihood(goal).mean()
-            loss += self.config.goal_weight * metrics["goal_loss"]
-        return loss, metrics
+        return behavioural_cloning(self.config, output, action, demo, whitening, self.goal_indices)

@@ -119,6 +119,16 @@ def spatial_soft_argmax(features: jax.Array, temperature: jax.Array) -> jax.Arra
     return jnp.concatenate(points, axis=-1)
 
 
+class SpatialSoftArgmax(nn.Module):
+    """`spatial_soft_argmax` with a learned temperature for every channel."""
+
+    @nn.compact
+    def __call__(self, features: jax.Array) -> jax.Array:
+        """Maps [B, H, W, C] to [B, 2 C]."""
+        log_temperature = self.param("log_temperature", nn.initializers.zeros, features.shape[-1:])
+        return spatial_soft_argmax(features, jnp.exp(log_temperature))
+
+
 def centred_layer_norm(x: jax.Array, bias: jax.Array) -> jax.Array:
     """Layer normalisation over all axes but the first, with a learned centre and no learned scale."""
     axes = tuple(range(1, x.ndim))

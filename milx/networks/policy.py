@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from milx.config import NetworkConfig
 from milx.networks.goal import Goal, GoalHead
-from milx.networks.layers import ConvBlock, Dense, spatial_soft_argmax
+from milx.networks.layers import ConvBlock, Dense, SpatialSoftArgmax
 from milx.types import Params
 
 
@@ -32,11 +32,67 @@ class PolicyNetwork(NamedTuple):
 
     Attributes:
         init: key -> params.
-        apply: (params, image [B, H, W, 3] uint8, whitened state [B, S]) -> PolicyOutput.
+        apply: (params, image [B, H, W, 3] uint8 or None, whitened state [B, S]) -> PolicyOutput.
     """
 
     init: Callable[[jax.Array], Params]
-    apply: Callable[[Params, jax.Array, jax.Array], PolicyOutput]
+    apply: Callable[[Params, jax.Array | None, jax.Array], PolicyOutput]
+
+
+class ConvStack(nn.Module):
+    """All convolutions: images [B, H, W, 3] uint8 to a feature map [B, H', W', C] of the parameters' type."""
+
+    config: NetworkConfig
+
+    @nn.compact
+    def __call__(self, image: jax.Array, dtype: jnp.dtype) -> jax.Array:
+        """`dtype` is that of the parameters."""
+        config = self.config
+        x = image.astype(dtype) / 255.0
+        block = nn.remat(ConvBlock) if config.rematerialise else ConvBlock
+        for i, (filters, stride) in enumerate(zip(config.filters, config.strides, strict=True)):
+            x = block(filters, config.kernel, stride, config.mixed_precision, name=f"ConvBlock_{i}")(x)
+        return x.astype(dtype)
+
+
+class Controller(nn.Module):
+    """From a feature map and the robot's state to an action.
+
+    Attributes:
+        config: layers and heads.
+        action_size: A.
+        goal_size: G.
+    """
+
+    config: NetworkConfig
+    action_size: int
+    goal_size: int
+
+    @nn.compact
+    def __call__(
+        self, features: jax.Array | None, state: jax.Array, context: jax.Array, query: jax.Array | None = None
+    ) -> PolicyOutput:
+        """Acts.
+
+        Args:
+            features: [B, H, W, C]; None where the policy sees no pixels.
+            state: [B, S] whitened.
+            context: [B, D], joins the input of the first fully connected layer.
+            query: [B, C], joins the goal head's filter; None for none.
+        """
+        config, goal = self.config, None
+        parts = [state, context]
+        if features is not None:
+            seen = SpatialSoftArgmax()(features) if config.soft_argmax else features.reshape(len(features), -1)
+            parts = [seen, *parts]
+            if config.goal_head:
+                goal = GoalHead(self.goal_size, name="goal_head")(features, query)
+                parts.append(goal.mean)
+        x = jnp.concatenate(parts, axis=-1)
+        for size in config.fc_layers:
+            x = Dense(size, hidden=True, norm=config.fc_norm, init_std=config.fc_init_std)(x)
+        heads = [Dense(self.action_size, init_std=config.fc_init_std)(x) for _ in range(config.heads)]
+        return PolicyOutput(action=heads[-1], inner_action=heads[0], goal=goal)
 
 
 class _Policy(nn.Module):
@@ -45,50 +101,35 @@ class _Policy(nn.Module):
     goal_size: int
 
     @nn.compact
-    def __call__(self, image: jax.Array, state: jax.Array) -> PolicyOutput:
-        config = self.config
-        x = image.astype(state.dtype) / 255.0
-        block = nn.remat(ConvBlock) if config.rematerialise else ConvBlock
-        for i, (filters, stride) in enumerate(zip(config.filters, config.strides, strict=True)):
-            x = block(filters, config.kernel, stride, config.mixed_precision, name=f"ConvBlock_{i}")(x)
-        x = x.astype(state.dtype)
-        goal = GoalHead(self.goal_size, name="goal_head")(x) if config.goal_head else None
-        if config.soft_argmax:
-            x = spatial_soft_argmax(x, jnp.exp(self.param("log_temperature", nn.initializers.zeros, x.shape[-1:])))
-        else:
-            x = x.reshape(len(x), -1)
-
+    def __call__(self, image: jax.Array | None, state: jax.Array) -> PolicyOutput:
         # A learned constant joins the input of the first layer: its gradient gives the layer's bias a step of its own
         # (the paper's bias transformation, Section 4.1).
-        z = self.param("bias_transformation", nn.initializers.zeros, (config.bias_transformation,))
-        parts = [x, state, jnp.broadcast_to(z, (len(x), *z.shape))]
-        if goal is not None:
-            parts.append(goal.mean)
-        x = jnp.concatenate(parts, axis=-1)
-        for features in config.fc_layers:
-            x = Dense(features, hidden=True, norm=config.fc_norm, init_std=config.fc_init_std)(x)
-        heads = [Dense(self.action_size, init_std=config.fc_init_std)(x) for _ in range(config.heads)]
-        return PolicyOutput(action=heads[-1], inner_action=heads[0], goal=goal)
+        size = self.config.bias_transformation
+        z = self.param("bias_transformation", nn.initializers.zeros, (size,))
+        features = None if image is None else ConvStack(self.config, name="vision")(image, state.dtype)
+        controller = Controller(self.config, self.action_size, self.goal_size, name="controller")
+        return controller(features, state, jnp.broadcast_to(z, (len(state), size)))
 
 
 def make_policy(
-    config: NetworkConfig, image_shape: tuple[int, int], state_size: int, action_size: int, goal_size: int
+    config: NetworkConfig, image_shape: tuple[int, int] | None, state_size: int, action_size: int, goal_size: int
 ) -> PolicyNetwork:
     """Builds the policy network.
 
     Args:
         config: layers and heads.
-        image_shape: (H, W).
+        image_shape: (H, W); None where the policy sees no pixels.
         state_size: S.
         action_size: A.
         goal_size: G, entries of the state that the goal head predicts.
     """
     module = _Policy(config, action_size, goal_size)
+    image = None if image_shape is None else jnp.zeros((1, *image_shape, 3), jnp.uint8)
 
     def init(key: jax.Array) -> Params:
-        return module.init(key, jnp.zeros((1, *image_shape, 3), jnp.uint8), jnp.zeros((1, state_size)))["params"]
+        return module.init(key, image, jnp.zeros((1, state_size)))["params"]
 
-    def apply(params: Params, image: jax.Array, state: jax.Array) -> PolicyOutput:
+    def apply(params: Params, image: jax.Array | None, state: jax.Array) -> PolicyOutput:
         output = module.apply({"params": params}, image, state)
         assert isinstance(output, PolicyOutput)
         return output

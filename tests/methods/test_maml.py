@@ -249,7 +249,7 @@ def test_votes_start_from_the_cameras_calibration_in_whitened_units():
     whitening, corner = random_whitening(np.random.default_rng(4)), np.array([0.3, -0.6, 1.0])
     image_to_goal = ((0.4, 0.0), (0.1, -0.2), (0.3, 0.5))
     method = MIL(MILConfig(), network, GOAL_INDICES, image_to_goal)
-    votes = corner @ np.asarray(method.init(jax.random.key(0), whitening)["policy"]["goal_head"]["vote"])
+    votes = corner @ np.asarray(method.init(jax.random.key(0), whitening)["policy"]["controller"]["goal_head"]["vote"])
     state = np.zeros(STATE)
     state[list(GOAL_INDICES)] = corner @ np.array(image_to_goal)
     np.testing.assert_allclose(votes, np.asarray(whitening.state(state))[list(GOAL_INDICES)], rtol=1e-6)
@@ -323,7 +323,8 @@ def test_with_two_heads_the_inner_step_leaves_the_head_that_acts(batch):
     for heads in (1, 2):
         method, params = build({"heads": heads})
         step = difference(jax.jit(method.adapt)(params, support)["policy"], params["policy"])
-        moved[heads] = {layer: float(optax.tree.norm(part)) for layer, part in step.items()}
+        parts = {**step.pop("controller"), **step}
+        moved[heads] = {layer: float(optax.tree.norm(part)) for layer, part in parts.items()}
     assert moved[2].pop("Dense_2") == 0, "the last layer before the action"
     for heads in (1, 2):
         assert min(moved[heads].values()) > 1e-4, moved[heads]

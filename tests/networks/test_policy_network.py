@@ -28,6 +28,11 @@ def build(**changes):
     return network, jax.tree.unflatten(tree, [leaf + 0.3 * rng.standard_normal(leaf.shape) for leaf in leaves])
 
 
+def with_layers(params, **layers):
+    """The parameters with other layers in the controller."""
+    return {**params, "controller": {**params["controller"], **layers}}
+
+
 def test_bias_transformation_gives_the_first_bias_a_learned_step(inputs):
     """Paper, Section 4.1: with z the vector and W its rows of the first layer, z W + b is the layer's bias.
 
@@ -40,8 +45,9 @@ def test_bias_transformation_gives_the_first_bias_a_learned_step(inputs):
         return jnp.sum(jnp.sin(network.apply(params, *inputs).action))
 
     gradient = jax.jit(jax.grad(loss))(params)
-    z, W = params["bias_transformation"], params["Dense_0"]["kernel"][-5:]
-    dz, dW, g = gradient["bias_transformation"], gradient["Dense_0"]["kernel"][-5:], gradient["Dense_0"]["bias"]
+    z, W = params["bias_transformation"], params["controller"]["Dense_0"]["kernel"][-5:]
+    slope = gradient["controller"]["Dense_0"]
+    dz, dW, g = gradient["bias_transformation"], slope["kernel"][-5:], slope["bias"]
     assert np.count_nonzero(g) > 2
     np.testing.assert_allclose(dz, W @ g, atol=1e-12)
     np.testing.assert_allclose(dW, jnp.outer(z, g), atol=1e-12)
@@ -53,19 +59,20 @@ def test_bias_transformation_gives_the_first_bias_a_learned_step(inputs):
     np.testing.assert_allclose(moved, step + second_order, atol=1e-14)
 
     # The network sees no more of (z, W_2) than that bias.
-    folded = {**params, "bias_transformation": jnp.zeros(5)}
-    folded["Dense_0"] = {**params["Dense_0"], "bias": params["Dense_0"]["bias"] + z @ W}
+    first = params["controller"]["Dense_0"]
+    folded = with_layers(params, Dense_0={**first, "bias": first["bias"] + z @ W})
+    folded["bias_transformation"] = jnp.zeros(5)
     np.testing.assert_allclose(network.apply(folded, *inputs).action, network.apply(params, *inputs).action, rtol=1e-12)
 
 
 def test_without_bias_transformation_nothing_of_it_is_left(inputs):
     network, params = build(bias_transformation=0)
     wide, wide_params = build()
-    width = wide_params["Dense_0"]["kernel"].shape[0] - params["Dense_0"]["kernel"].shape[0]
-    assert width == 5
+    first = params["controller"]["Dense_0"]
+    assert wide_params["controller"]["Dense_0"]["kernel"].shape[0] - first["kernel"].shape[0] == 5
     # A zero vector is as good as none.
-    wide_params = {**params, "bias_transformation": jnp.zeros(5), "Dense_0": dict(params["Dense_0"])}
-    wide_params["Dense_0"]["kernel"] = jnp.concatenate([params["Dense_0"]["kernel"], jnp.ones((5, 8))])
+    widened = {**first, "kernel": jnp.concatenate([first["kernel"], jnp.ones((5, 8))])}
+    wide_params = {**with_layers(params, Dense_0=widened), "bias_transformation": jnp.zeros(5)}
     np.testing.assert_allclose(wide.apply(wide_params, *inputs).action, network.apply(params, *inputs).action)
 
 
@@ -93,7 +100,8 @@ def test_one_head_answers_both_losses_and_two_heads_share_all_but_the_last_layer
 
     network, params = build(heads=2)
     output = network.apply(params, *inputs)
-    swapped = {**params, "Dense_1": params["Dense_2"], "Dense_2": params["Dense_1"]}
+    layers = params["controller"]
+    swapped = with_layers(params, Dense_1=layers["Dense_2"], Dense_2=layers["Dense_1"])
     np.testing.assert_array_equal(network.apply(swapped, *inputs).action, output.inner_action)
     np.testing.assert_array_equal(network.apply(swapped, *inputs).inner_action, output.action)
     assert np.abs(output.action - output.inner_action).min() > 1e-6
@@ -101,12 +109,11 @@ def test_one_head_answers_both_losses_and_two_heads_share_all_but_the_last_layer
 
 def test_the_prediction_of_the_goal_reaches_the_action(inputs):
     network, params = build(goal_head=True)
-    head = params["goal_head"]
+    head, first = params["controller"]["goal_head"], params["controller"]["Dense_0"]
     # The expected goal is appended to the input of the first layer: a shift of all votes acts through its rows.
     shift = jnp.array([0.3, -0.7])
-    moved = {**params, "goal_head": {**head, "vote": head["vote"].at[-1].add(shift)}}
-    first = params["Dense_0"]
-    folded = {**params, "Dense_0": {**first, "bias": first["bias"] + shift @ first["kernel"][-GOAL:]}}
+    moved = with_layers(params, goal_head={**head, "vote": head["vote"].at[-1].add(shift)})
+    folded = with_layers(params, Dense_0={**first, "bias": first["bias"] + shift @ first["kernel"][-GOAL:]})
     plain, moved, folded = (network.apply(p, *inputs) for p in (params, moved, folded))
     np.testing.assert_allclose(moved.goal.mean, plain.goal.mean + shift, rtol=1e-9)
     np.testing.assert_allclose(moved.action, folded.action, rtol=1e-9)
