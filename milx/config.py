@@ -295,17 +295,19 @@ def differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
     return [f"{name} was {before[name]}, now {after[name]}" for name in before if before[name] != after[name]]
 
 
-def unset(config: Config, field: str) -> None:
-    """Sets the field with this dotted name to None.
+def assign(config: Config, field: str, value: Any) -> None:
+    """Sets the field with this dotted name.
 
     Raises:
-        ValueError: if it cannot be None.
+        ValueError: if there is no such field, or the value is None and the field cannot be.
     """
+    if field not in flatten(to_dict(config)):
+        raise ValueError(f"config.{field}: no such field")
     *path, name = field.split(".")
     holder: Any = functools.reduce(getattr, path, config)
-    if type(None) not in typing.get_args(typing.get_type_hints(type(holder))[name]):
+    if value is None and type(None) not in typing.get_args(typing.get_type_hints(type(holder))[name]):
         raise ValueError(f"config.{field}: got None, expected a value")
-    setattr(holder, name, None)
+    setattr(holder, name, value)
 
 
 def overrides(config: Config) -> dict[str, Any]:

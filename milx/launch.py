@@ -77,7 +77,7 @@ def _parse(argv: Sequence[str]) -> list[str]:
     unset = [arg for arg in argv if arg.startswith("--config.") and arg.endswith("=None")]
     for arg in unset:  # ml_collections has no way to say None
         try:
-            config_lib.unset(config, arg.removeprefix("--config.").removesuffix("=None"))
+            config_lib.assign(config, arg.removeprefix("--config.").removesuffix("=None"), None)
         except ValueError as error:
             raise flags.Error(str(error)) from error
     rest = [arg for arg in argv if arg not in unset]

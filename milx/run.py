@@ -22,7 +22,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from milx import config as config_lib
-from milx import envs, evaluator, methods, parallel, platform, provenance, report, whitening
+from milx import envs, evaluator, methods, parallel, platform, report, results, whitening
 from milx.checkpoint import Checkpoints
 from milx.config import Config
 from milx.data import demos as demos_lib
@@ -50,9 +50,17 @@ def split_demos(env: envs.Env, config: Config, split: str) -> DemoSet:
     return demos_lib.cached(folder, env, seed, split, num_tasks, num_demos, config.data)
 
 
-def _trial_key(split: str) -> jax.Array:
+def trial_key(split: str) -> jax.Array:
     """Draws the trial scenes of a split."""
     return jax.random.fold_in(jax.random.key(EVALUATION_SEED), len(envs.SPLITS) + envs.SPLITS.index(split))
+
+
+def initial_state(trainer: Trainer, config: Config, train: DemoSet) -> tuple[TrainState, jax.Array]:
+    """The state before the first meta-update on these demonstrations, and the key of the batches."""
+    init_key, batch_key = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), 3))
+    seen = jax.jit(jax.vmap(jax.vmap(jax.vmap(trainer.env.robot_state))))(train.states)
+    statistics = whitening.fit(seen, train.action, config.mil.whiten_actions)
+    return jax.jit(trainer.init)(init_key, statistics), batch_key
 
 
 class Run:
@@ -144,12 +152,20 @@ class Run:
         _, extra = checkpoints.restore(checkpoints.latest, {})
         self.seconds = extra["seconds"]
         config, test = self.config.evaluation, self.demos("test")
-        key = _trial_key("test")
+        key = trial_key("test")
         with self._clock("evaluate"):
             trials = evaluator.run_trials(self.env, self.method, items["params"], test, config, key)
             floors = evaluator.baselines(self.env, test, config, self.config.data, key)
-        result = self._result(evaluator.summary(trials.success), floors, step, extra["dataset_hash"])
-        _write_json(self.folder / "evaluation.json", result)
+        result = results.describe(
+            self.config,
+            self.env,
+            evaluator.summary(trials.success),
+            floors,
+            self._elapsed(),
+            step,
+            extra["dataset_hash"],
+        )
+        results.write_json(self.folder / "evaluation.json", result)
         report.learning_curve(
             report.read_metrics(self.folder / "metrics.jsonl"), result, self.folder / "learning_curve.png"
         )
@@ -199,10 +215,7 @@ class Run:
 
     def _start(self, train: DemoSet, dataset_hash: str, checkpoints: Checkpoints) -> tuple[TrainState, jax.Array]:
         """The state to train from, and the key of the batches."""
-        init_key, batch_key = jax.random.split(jax.random.fold_in(jax.random.key(self.config.seed), 3))
-        seen = jax.jit(jax.vmap(jax.vmap(jax.vmap(self.env.robot_state))))(train.states)
-        statistics = whitening.fit(seen, train.action, self.config.mil.whiten_actions)
-        state = jax.jit(self.trainer.init)(init_key, statistics)
+        state, batch_key = initial_state(self.trainer, self.config, train)
         if checkpoints.latest is not None:
             like = {"params": state.params, "trainer": (state.step, state.optimizer)}
             items, extra = checkpoints.restore(checkpoints.latest, like)
@@ -219,7 +232,7 @@ class Run:
         return state, batch_key
 
     def _validate(self, params: Params, validation: DemoSet) -> float:
-        key = _trial_key("validation")
+        key = trial_key("validation")
         with self._clock("evaluate"):
             trials = evaluator.run_trials(self.env, self.method, params, validation, self.config.evaluation, key)
             return float(trials.success.mean())
@@ -233,30 +246,6 @@ class Run:
         clips = [evaluator.film(camera, task, jax.tree.map(lambda x: x[:, 0], states)) for states in (demo, trial)]
         report.side_by_side(np.asarray(clips[0]), np.asarray(clips[1]), self.folder / "rollouts.gif")
 
-    def _result(
-        self, summary: dict[str, Any], floors: dict[str, float], step: int, dataset_hash: str
-    ) -> dict[str, Any]:
-        config = self.config
-        return {
-            "env": config.env_name,
-            "method": config.method_name,
-            "preset": config.preset,
-            "variant": ", ".join(f"{name}={value}" for name, value in config_lib.overrides(config).items()),
-            "seed": config.seed,
-            "num_tasks_train": config.data.tasks,
-            "num_demos_train": config.data.tasks * config.data.demos_per_task,
-            "shots": config.evaluation.shots,
-            "given": "video+state+action",
-            **summary,
-            "criterion": self.env.criterion,
-            "baselines": floors,
-            "wall_clock_s": self._elapsed(),
-            "steps": step,
-            "config": config_lib.to_dict(config),
-            "dataset_hash": dataset_hash,
-            **provenance.describe(),
-        }
-
     def _claim_folder(self) -> None:
         """Writes the configuration, or checks that the folder's is the same."""
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -268,7 +257,7 @@ class Run:
             if changed:
                 raise ValueError(f"workdir: {self.folder} holds another run: {'; '.join(changed)}")
         else:
-            _write_json(path, mine)
+            results.write_json(path, mine)
 
     @contextlib.contextmanager
     def _clock(self, name: str) -> Iterator[None]:
@@ -293,10 +282,3 @@ class Run:
             TimeRemainingColumn(),
         )
         return Progress(*columns, console=self.console)
-
-
-def _write_json(path: pathlib.Path, values: dict[str, Any]) -> None:
-    """Writes a file as a whole: a process that is killed leaves the old one or the new one."""
-    partial = path.with_suffix(".partial")
-    partial.write_text(json.dumps(values, indent=1) + "\n")
-    partial.replace(path)

@@ -60,7 +60,7 @@ def test_unknown_field_is_refused_and_the_valid_ones_listed(values, message, val
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"env": "nope"}, "env: got 'nope', expected one of reach"),
+        ({"env": "nope"}, "env: got 'nope', expected one of reach, reach_state"),
         ({"env": "reach", "preset": "nope"}, "preset: got 'nope', expected one of paper, fast, cpu"),
     ],
 )
@@ -71,7 +71,9 @@ def test_unknown_env_or_preset_is_refused_and_the_valid_ones_listed(arguments, m
 
 def test_unknown_method_is_refused_and_the_valid_ones_listed():
     spec = Spec(image_shape=(8, 10), state_size=4, action_size=2, action_range=((-1, -1), (1, 1)), goal_indices=(0,))
-    with pytest.raises(ValueError, match=re.escape("method: got 'nope', expected one of mil")):
+    with pytest.raises(
+        ValueError, match=re.escape("method: got 'nope', expected one of mil, contextual, lstm, lstm_attention")
+    ):
         methods.make(make_config("reach", "nope"), spec)
 
 
@@ -94,13 +96,23 @@ def test_overrides_are_what_differs_from_the_preset():
     assert config_lib.overrides(config) == {"network.filters": (1, 2), "mil.inner_steps": 5}
 
 
-def test_only_optional_fields_can_be_unset():
+def test_fields_are_assigned_by_name_and_only_optional_ones_take_none():
     config = make_config("reach", preset="cpu")
     assert config.train.support_frames is not None
-    config_lib.unset(config, "train.support_frames")
-    assert config.train.support_frames is None
+    config_lib.assign(config, "train.support_frames", None)
+    config_lib.assign(config, "mil.inner_steps", 3)
+    assert config_lib.overrides(config) == {"train.support_frames": None, "mil.inner_steps": 3}
     with pytest.raises(ValueError, match=r"config\.train\.steps: got None, expected a value"):
-        config_lib.unset(config, "train.steps")
+        config_lib.assign(config, "train.steps", None)
+    with pytest.raises(ValueError, match=r"config\.train\.stepz: no such field"):
+        config_lib.assign(config, "train.stepz", 1)
+
+
+@pytest.mark.parametrize(("env", "preset"), [pair for pair in ALL if pair[1] != "paper"])
+def test_methods_that_do_not_imitate_the_demonstration_see_what_they_see_at_test(env, preset):
+    """The last frame is all that a contextual policy looks at; a recurrent one must train on whole demonstrations."""
+    frames = {method: make_config(env, method, preset).train.support_frames for method in methods.METHODS}
+    assert (frames["contextual"], frames["lstm"], frames["lstm_attention"]) == (1, None, None)
 
 
 def test_flatten_joins_names_with_dots():

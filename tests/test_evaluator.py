@@ -83,7 +83,7 @@ def test_no_trial_takes_place_in_the_demonstration_s_scene(trained, split, monke
         evaluator, "_run_batch", lambda env, method, params, task, states, action, scene, key: (scene, states, action)
     )
     config = dataclasses.replace(trained.config.evaluation, trials=10)
-    key = run_lib._trial_key(split)
+    key = run_lib.trial_key(split)
     scene, states, action = evaluator.run_trials(trained.run.env, trained.run.method, (), demos, config, key)
     np.testing.assert_array_equal(action, demos.action[:, :1])
     cubes, shown = np.asarray(scene.mocap_pos), np.asarray(states.mocap_pos[:, :, 0])
@@ -98,7 +98,7 @@ def test_no_trial_takes_place_in_the_demonstration_s_scene(trained, split, monke
 
 @pytest.mark.parametrize(("trials", "asked", "tried"), [(3, 1, 1), (2, 2, 2), (2, 10, 2)])
 def test_baselines_run_in_the_first_trials(trained, monkeypatch, trials, asked, tried):
-    env, key = trained.run.env, run_lib._trial_key("test")
+    env, key = trained.run.env, run_lib.trial_key("test")
     config = dataclasses.replace(trained.config.evaluation, trials=trials, baseline_trials=asked)
     asked_for = {}
 
@@ -137,7 +137,7 @@ def test_programs_compiled_ahead_are_found(trained, caplog):
 
 def test_validation_and_test_trials_differ(trained):
     scenes = [
-        evaluator.trial_scenes(trained.run.env, trained.test.task, run_lib._trial_key(split), 4).mocap_pos
+        evaluator.trial_scenes(trained.run.env, trained.test.task, run_lib.trial_key(split), 4).mocap_pos
         for split in ("validation", "test")
     ]
     assert np.abs(scenes[0] - scenes[1]).max(axis=(-2, -1)).min() > 0.01

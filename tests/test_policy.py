@@ -11,7 +11,7 @@ import pytest
 import milx
 from milx.checkpoint import Checkpoints
 from milx.data.demos import render_demo
-from milx.policy import params_like
+from milx.policy import check_demo, check_observation, params_like
 
 T, H, W, S, A = 5, 32, 40, 8, 2
 
@@ -191,6 +191,20 @@ def test_bad_observation_is_refused(policy, task_params, case):
     good = milx.Observation(image=np.zeros((H, W, 3), np.uint8), state=np.zeros(S, np.float32))
     with pytest.raises(ValueError, match="^" + re.escape(message)):
         policy.act(task_params, dataclasses.replace(good, **change))
+
+
+def test_a_policy_without_pixels_takes_none(policy):
+    spec = dataclasses.replace(policy.spec, image_shape=None)
+    good = good_demo()
+    checked = check_demo(dataclasses.replace(good, image=None), spec)
+    assert checked.image is None
+    np.testing.assert_array_equal(checked.state[0], good.state)
+    with pytest.raises(
+        ValueError, match=re.escape("demo.image: got ndarray, expected None: this policy sees no pixels")
+    ):
+        check_demo(good, spec)
+    with pytest.raises(ValueError, match=re.escape("observation.image: got ndarray, expected None")):
+        check_observation(milx.Observation(good.image[0], good.state[0]), spec)
 
 
 def test_folder_without_a_run_is_refused(tmp_path):

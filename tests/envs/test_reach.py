@@ -155,6 +155,20 @@ def test_robot_state_is_that_of_c_mujoco(env, states):
         np.testing.assert_allclose(robot[i, t], expected, rtol=1e-9, atol=1e-9)
 
 
+def test_state_reach_tells_the_robot_s_state_and_the_cubes_by_number(env, task):
+    blind = milx.make("reach_state")
+    state = jax.jit(env.reset)(jax.random.key(3), task)
+    state = dataclasses.replace(state, qpos=jnp.array([0.4, -1.1]), qvel=jnp.array([0.3, 0.2]))
+    seen = blind.observe(task, state)
+    assert seen.image is None
+    np.testing.assert_allclose(seen.state[:8], env.robot_state(state), atol=1e-12)
+    for cube, (x, y) in enumerate(blind.object_indices):
+        aim = dataclasses.replace(task, target=jnp.int32(cube))
+        off = seen.state[jnp.array(blind.goal_indices)] - seen.state[jnp.array([x, y])]
+        np.testing.assert_allclose(off, env.off_target(aim, state), atol=1e-12)
+        np.testing.assert_array_equal(blind.observe(aim, state).state, seen.state)  # nothing tells the target
+
+
 # Tasks and scenes.
 
 

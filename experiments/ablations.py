@@ -1,0 +1,60 @@
+"""What each part of MIL is worth on vision reach: one thing changed at a time, and more shots at test.
+
+    python experiments/ablations.py              # what is missing, then the table
+
+Stopped and started again it goes on with the next cell.
+"""
+
+import pathlib
+from typing import Any
+
+import cells
+from absl import app, flags
+
+from milx import config as config_lib
+from milx.config import Config, make_config
+
+ABLATIONS: dict[str, dict[str, Any]] = {
+    "as it is": {},
+    "5 shots at test": {"evaluation.shots": 5},
+    "no bias transformation": {"network.bias_transformation": 0},
+    "first order": {"mil.first_order": True},
+    "fixed inner rate": {"mil.learn_inner_lr": False},
+    "3 inner steps": {"mil.inner_steps": 3},
+    "5 inner steps": {"mil.inner_steps": 5},
+    "two heads": {"network.heads": 2},
+    "no goal head": {"network.goal_head": False, "mil.goal_weight": 0.0},
+}
+
+_HERE = pathlib.Path(__file__).parent
+_OUT = flags.DEFINE_string("out", str(_HERE / "results" / "ablations"), "Folder of the JSON files.")
+_PRESET = flags.DEFINE_string("preset", "fast", "Hyperparameters of all that is not changed.")
+_SEEDS = flags.DEFINE_integer("seeds", 2, "Seeds of each.")
+
+
+def configure(changes: dict[str, Any], seed: int) -> Config:
+    """The preset with some fields, by dotted name, changed."""
+    config = make_config("reach", preset=_PRESET.value, seed=seed)
+    for name, value in changes.items():
+        config_lib.assign(config, name, value)
+    return config
+
+
+def main(_: list[str]) -> None:
+    """Runs what is missing and prints a table."""
+    folder = pathlib.Path(_OUT.value)
+    runner = cells.Cells(folder, configure({}, seed=0).data.tasks)
+    for seed in range(_SEEDS.value):
+        for name, changes in ABLATIONS.items():
+            runner.run(f"{name.replace(' ', '-')}-{seed}", configure(changes, seed))
+    results = cells.read(folder)
+    print("| changed | " + " | ".join(f"seed {seed}" for seed in range(_SEEDS.value)) + " | training |")
+    print("|---|" + "---|" * (_SEEDS.value + 1))
+    for name in ABLATIONS:
+        runs = [results[f"{name.replace(' ', '-')}-{seed}"] for seed in range(_SEEDS.value)]
+        shown = [f"{run['success']:.1%} ({run['wilson95'][0]:.1%} to {run['wilson95'][1]:.1%})" for run in runs]
+        print(f"| {name} | {' | '.join(shown)} | {runs[0]['wall_clock_s']['train']:.0f} s |")
+
+
+if __name__ == "__main__":
+    app.run(main)

@@ -1,0 +1,48 @@
+"""Result files: one JSON object for a run, the same for all experiments."""
+
+import json
+import pathlib
+from typing import Any
+
+from milx import config as config_lib
+from milx import provenance
+from milx.config import Config
+from milx.envs.base import Env
+
+
+def describe(
+    config: Config,
+    env: Env,
+    summary: dict[str, Any],
+    floors: dict[str, float],
+    seconds: dict[str, float],
+    step: int,
+    dataset_hash: str,
+) -> dict[str, Any]:
+    """A result as its JSON file holds it: what was run, what came out, what it took, and where."""
+    return {
+        "env": config.env_name,
+        "method": config.method_name,
+        "preset": config.preset,
+        "variant": ", ".join(f"{name}={value}" for name, value in config_lib.overrides(config).items()),
+        "seed": config.seed,
+        "num_tasks_train": config.data.tasks,
+        "num_demos_train": config.data.tasks * config.data.demos_per_task,
+        "shots": config.evaluation.shots,
+        "given": "video+state+action" if env.vision else "state+action",
+        **summary,
+        "criterion": env.criterion,
+        "baselines": floors,
+        "wall_clock_s": seconds,
+        "steps": step,
+        "config": config_lib.to_dict(config),
+        "dataset_hash": dataset_hash,
+        **provenance.describe(),
+    }
+
+
+def write_json(path: pathlib.Path, values: dict[str, Any]) -> None:
+    """Writes a file as a whole: a process that is killed leaves the old one or the new one."""
+    partial = path.with_suffix(".partial")
+    partial.write_text(json.dumps(values, indent=1) + "\n")
+    partial.replace(path)

@@ -1,0 +1,129 @@
+"""Every method learns from a demonstration what no observation tells, and contexts keep what they promise."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from milx import methods
+from milx.config import Config, MILConfig, NetworkConfig
+from milx.types import Demo, Observation, TaskBatch
+from milx.whitening import Whitening
+
+IMAGE_SHAPE, STATE, ACTION, STEPS = (8, 10), 7, 2, 5
+OBJECTS = ((1, 2), (3, 4), (5, 6))
+VISION, FROM_STATE = ("mil", "contextual", "lstm"), ("lstm_attention",)
+
+
+@functools.cache
+def build(name):
+    """A tiny method, its parameters, and a whitening that changes nothing."""
+    vision = name in VISION
+    spec = methods.Spec(
+        image_shape=IMAGE_SHAPE if vision else None,
+        state_size=STATE,
+        action_size=ACTION,
+        action_range=((-1.0,) * ACTION, (1.0,) * ACTION),
+        goal_indices=(),
+        object_indices=() if vision else OBJECTS,
+    )
+    network = NetworkConfig(
+        filters=(4,) * vision, strides=(2,) * vision, fc_layers=(16, 16), bias_transformation=4, context=8
+    )
+    config = Config(network=network, mil=MILConfig(inner_lr=0.1, learn_inner_lr=True))
+    method = methods.make(dataclasses.replace(config, method_name=name), spec)
+    zeros, ones = (fill((size,)) for fill, size in ((jnp.zeros, STATE), (jnp.ones, STATE)))
+    whitening = Whitening(zeros, ones, jnp.zeros(ACTION), jnp.ones(ACTION))
+    return method, jax.jit(method.init)(jax.random.key(0), whitening)
+
+
+def random_demos(rng, vision, *shape):
+    """Demonstrations with leading axes `shape`."""
+    image = rng.integers(0, 256, (*shape, STEPS, *IMAGE_SHAPE, 3), dtype=np.uint8) if vision else None
+    state, action = (rng.standard_normal((*shape, STEPS, size)).astype(np.float32) for size in (STATE, ACTION))
+    return jax.tree.map(jnp.asarray, Demo(image, state, action))
+
+
+@functools.cache
+def two_tasks(vision):
+    """Two tasks with different demonstrations; the queries show the same, but ask for other actions."""
+    rng = np.random.default_rng(0)
+    support, query = random_demos(rng, vision, 2, 1), random_demos(rng, vision, 2, 1)
+    same = jax.tree.map(lambda x: jnp.stack([x[0], x[0]]), query)
+    return TaskBatch(support, dataclasses.replace(same, action=query.action))
+
+
+@functools.cache
+def trained(name):
+    """The parameters after they were fitted to the two tasks."""
+    method, params = build(name)
+    batch, optimizer = two_tasks(name in VISION), optax.adam(3e-3)
+
+    def update(carry, _):
+        params, state = carry
+        gradient = jax.grad(lambda params: method.loss(params, batch)[0])(params)
+        updates, state = optimizer.update(gradient, state)
+        return (optax.apply_updates(params, updates), state), None
+
+    fit = jax.jit(lambda carry: jax.lax.scan(update, carry, length=600)[0])
+    return fit((params, optimizer.init(params)))[0]
+
+
+@pytest.mark.parametrize("name", VISION + FROM_STATE)
+def test_a_method_fits_two_tasks_and_with_swapped_demonstrations_does_the_other(name):
+    """No observation tells the two tasks apart: blind, a policy errs by a quarter of their squared difference.
+
+    Fitted, it errs by nothing; told the other task, it does the other, and errs by the whole difference.
+    """
+    method, _ = build(name)
+    batch = two_tasks(name in VISION)
+    swapped = dataclasses.replace(batch, support=jax.tree.map(lambda x: x[::-1], batch.support))
+    loss = jax.jit(lambda batch: method.loss(trained(name), batch)[0])
+    difference = float(jnp.square(batch.query.action[0] - batch.query.action[1]).mean())
+    assert loss(batch) < 0.02 * difference / 4
+    np.testing.assert_allclose(loss(swapped), difference, rtol=0.3)
+
+
+@pytest.mark.parametrize("name", VISION + FROM_STATE)
+def test_the_action_is_the_one_that_the_loss_knows(name):
+    """`adapt` and `act` outside, `loss` inside: the errors of the acted actions are the loss."""
+    method, params = build(name)
+    batch = two_tasks(name in VISION)
+
+    @jax.jit
+    def error(support, query):
+        task_params = method.adapt(params, support)
+        act = jax.vmap(lambda image, state: method.act(task_params, Observation(image, state), ())[0])
+        action = act(*jax.tree.map(lambda x: x[0], (query.image, query.state)))
+        return jnp.square(action - query.action[0]).mean()
+
+    each = [error(*jax.tree.map(lambda x, n=n: x[n], (batch.support, batch.query))) for n in range(2)]
+    np.testing.assert_allclose(np.mean(each), method.loss(params, batch)[0], rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["contextual", "lstm", "lstm_attention"])
+def test_several_demonstrations_give_the_mean_of_their_actions(name):
+    method, params = build(name)
+    demos = random_demos(np.random.default_rng(1), name in VISION, 3)
+    seen = jax.tree.map(lambda x: x[0, 0], demos)
+    act = jax.jit(lambda demo: method.act(method.adapt(params, demo), Observation(seen.image, seen.state), ())[0])
+    each = [act(jax.tree.map(lambda x, k=k: x[k : k + 1], demos)) for k in range(3)]
+    assert np.ptp(each, axis=0).min() > 1e-3
+    np.testing.assert_allclose(act(demos), np.mean(each, axis=0), atol=1e-6)
+
+
+def test_contextual_policies_see_the_last_frame_only_and_recurrent_ones_all():
+    demo = random_demos(np.random.default_rng(2), True, 1)
+    for name, frames_seen in (("contextual", [STEPS - 1]), ("lstm", list(range(STEPS)))):
+        method, params = build(name)
+        encode = jax.jit(lambda demo, method=method, params=params: method.adapt(params, demo)["context"])
+        context = encode(demo)
+        changed = [
+            float(jnp.abs(encode(dataclasses.replace(demo, image=demo.image.at[:, t].set(0))) - context).max())
+            for t in range(STEPS)
+        ]
+        assert [t for t in range(STEPS) if changed[t] > 1e-6] == frames_seen, name

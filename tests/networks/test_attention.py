@@ -1,0 +1,62 @@
+"""What the attentive policy looks at."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from milx.config import NetworkConfig
+from milx.networks.attention import AttentiveActor, ObjectTokens, split_objects
+
+STATE, ACTION, STEPS, BATCH = 7, 2, 5, 4
+OBJECTS = ((1, 2), (5, 6), (3, 4))
+CONFIG = NetworkConfig(filters=(), strides=(), fc_layers=(16,), context=8)
+
+
+@pytest.fixture(scope="module")
+def networks():
+    encoder, actor = ObjectTokens(CONFIG, OBJECTS), AttentiveActor(CONFIG, ACTION, OBJECTS)
+    tokens, encoding = encoder.init_with_output(jax.random.key(0), None, jnp.zeros((1, STATE)), jnp.zeros((1, ACTION)))
+    acting = actor.init(jax.random.key(1), tokens, None, jnp.zeros((1, STATE)))["params"]
+
+    @jax.jit
+    def attend(state, action, seen):
+        tokens = encoder.apply(encoding, None, state, action)
+        output, sown = actor.apply({"params": acting}, tokens, None, seen, mutable="intermediates")
+        return output.action, sown["intermediates"]
+
+    return attend
+
+
+@pytest.fixture
+def demo(rng):
+    return jnp.asarray(rng.standard_normal((STEPS, STATE))), jnp.asarray(rng.standard_normal((STEPS, ACTION)))
+
+
+def test_states_are_split_into_objects_and_the_rest():
+    places, rest = split_objects(jnp.arange(2 * STATE).reshape(2, STATE), OBJECTS)
+    np.testing.assert_array_equal(places[1], [[8, 9], [12, 13], [10, 11]])
+    np.testing.assert_array_equal(rest, [[0], [7]])
+
+
+def test_attention_is_a_distribution_that_the_demonstration_moves(networks, demo, rng):
+    seen = jnp.asarray(rng.standard_normal((BATCH, STATE)))
+    _, weights = networks(*demo, seen)
+    assert [w.shape for w in weights["time"]] == [(BATCH, STEPS, 3)] * 2
+    for name, axis in (("time", 1), ("object", 1)):
+        for w in weights[name]:
+            np.testing.assert_allclose(w.sum(axis=axis), 1, atol=1e-12)
+            assert w.min() > 0
+    _, other = networks(demo[0] + 1, demo[1], seen)
+    for name in ("time", "object"):
+        change = [float(jnp.abs(a - b).max()) for a, b in zip(weights[name], other[name], strict=True)]
+        assert min(change) > 1e-4, name
+
+
+def test_time_steps_of_a_demonstration_have_no_order(networks, demo, rng):
+    """Attention reads a set: a demonstration backwards gives the same action, with the weights backwards."""
+    seen = jnp.asarray(rng.standard_normal((BATCH, STATE)))
+    action, weights = networks(*demo, seen)
+    backwards, weights_backwards = networks(demo[0][::-1], demo[1][::-1], seen)
+    np.testing.assert_allclose(backwards, action, atol=1e-10)
+    np.testing.assert_allclose(weights_backwards["time"][0], weights["time"][0][:, ::-1], atol=1e-10)
