@@ -10,7 +10,7 @@ import json
 import pathlib
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,15 +22,35 @@ from milx.data import demos as demos_lib
 from milx.data.demos import DemoSet
 from milx.policy import spec_of
 from milx.run import initial_state, split_demos, trial_key
-from milx.trainer import Trainer, TrainState, make_optimizer
+from milx.trainer import Trainer, make_optimizer
 from milx.types import Params
+
+METHODS = {
+    "reach": ("mil", "contextual", "lstm"),
+    "reach_state": ("mil", "contextual", "lstm", "lstm_attention"),
+}
+"""What is compared in each environment."""
+
+
+class Trained(NamedTuple):
+    """What did best on validation tasks.
+
+    Attributes:
+        params: its parameters.
+        step: after how many meta-updates.
+        validation: its success there.
+    """
+
+    params: Params
+    step: int
+    validation: float
 
 
 class Cells:
-    """Runs cells whose result files do not exist yet.
+    """Runs cells, each a configuration with a name, and keeps what later ones can use again.
 
     Args:
-        folder: where the files are.
+        folder: where the result files are.
         capacity: tasks in the largest cell.
     """
 
@@ -39,78 +59,79 @@ class Cells:
         self._made: dict[Any, Any] = {}
 
     def run(self, name: str, config: Config) -> None:
-        """Trains and evaluates a cell and writes `name`.json; returns at once if there is one.
+        """Trains and evaluates a cell and writes `name`.json; returns at once if there is one."""
+        path = self.folder / f"{name}.json"
+        if path.is_file():
+            return
+        clock = [time.perf_counter()]
+        trainer, evaluation = self._trainer(config), config.evaluation
+        env, train, test = trainer.env, self._first_tasks(config), self._demos(config, "test")
+        floors = self._once(
+            ("floors", config.env_name),
+            lambda: evaluator.baselines(env, test, evaluation, config.data, trial_key("test")),
+        )
+        clock.append(time.perf_counter())
+        trained = self.train(name, config)
+        clock.append(time.perf_counter())
+        trials = evaluator.run_trials(env, trainer.method, trained.params, test, evaluation, trial_key("test"))
+        summary = evaluator.summary(trials.success)
+        clock.append(time.perf_counter())
+        laps = [later - earlier for earlier, later in itertools.pairwise(clock)]
+        seconds = {"demos": laps[0], "compile": 0.0, "train": laps[1], "evaluate": laps[2], "total": sum(laps)}
+        digest = demos_lib.fingerprint(train)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        results.write_json(path, results.describe(config, env, summary, floors, seconds, trained.step, digest))
+        print(f"{name}: {summary['success']:.1%} in {sum(laps):.0f} s", flush=True)
+
+    def train(self, name: str, config: Config) -> Trained:
+        """Meta-trains a cell; what differs in its evaluation only is not trained again.
 
         Raises:
             ValueError: if the number of tasks does not divide the capacity.
         """
-        path = self.folder / f"{name}.json"
-        if path.is_file():
-            return
         if self.capacity % config.data.tasks:
             raise ValueError(f"data.tasks: got {config.data.tasks}, expected a divisor of {self.capacity}")
-        began, laps = time.perf_counter(), [0.0]
-        trainer, evaluation = self._trainer(config), config.evaluation
-        train, test = self._demos(config, "train"), self._demos(config, "test")
-        train = jax.tree.map(lambda x: x[: config.data.tasks], train)
-        floors = self._once(
-            ("floors", config.env_name),
-            lambda: evaluator.baselines(trainer.env, test, evaluation, config.data, trial_key("test")),
+        return self._once(
+            ("trained", self._programs(config), config.seed, config.data.tasks), lambda: self._train(name, config)
         )
-        laps.append(time.perf_counter() - began)
-        same = self._key(config), config.seed, config.data.tasks
-        params, step = self._once(("params", *same), lambda: self._train(name, config, trainer, train))
-        laps.append(time.perf_counter() - began)
-        trials = evaluator.run_trials(trainer.env, trainer.method, params, test, evaluation, trial_key("test"))
-        summary = evaluator.summary(trials.success)
-        laps.append(time.perf_counter() - began)
-        demos, train_s, evaluate = (b - a for a, b in itertools.pairwise(laps))
-        seconds = {"demos": demos, "compile": 0.0, "train": train_s, "evaluate": evaluate, "total": laps[-1]}
-        digest = demos_lib.fingerprint(train)
-        result = results.describe(config, trainer.env, summary, floors, seconds, step, digest)
-        self.folder.mkdir(parents=True, exist_ok=True)
-        results.write_json(path, result)
-        print(f"{name}: {summary['success']:.1%} in {laps[-1]:.0f} s", flush=True)
 
-    def _train(self, name: str, config: Config, trainer: Trainer, train: DemoSet) -> tuple[Params, int]:
-        """Meta-trains; returns the parameters that did best on validation tasks, and their step."""
-        state, key = initial_state(trainer, config, train)
+    def _train(self, name: str, config: Config) -> Trained:
+        trainer, train, every = self._trainer(config), self._first_tasks(config), config.train.log_every
+        validation, evaluation, key = self._demos(config, "validation"), config.evaluation, trial_key("validation")
+        state, batch_key = initial_state(trainer, config, train)
         repeated = jax.tree.map(lambda x: jnp.concatenate([x] * (self.capacity // config.data.tasks)), train)
-        validation, evaluation = self._demos(config, "validation"), config.evaluation
-        best: tuple[float, TrainState] = (-1.0, state)
+        best = Trained(state.params, 0, -1.0)
         while int(state.step) < config.train.steps:
-            for _ in range(config.train.eval_every // config.train.log_every):
-                state, metrics = trainer.run(state, repeated, key, config.train.log_every)
-            trials = evaluator.run_trials(
-                trainer.env, trainer.method, state.params, validation, evaluation, trial_key("validation")
-            )
-            success = float(trials.success.mean())
-            print(
-                f"  {name} {int(state.step)}: loss {float(metrics['loss']):.3f}, validation {success:.1%}", flush=True
-            )
-            best = max(best, (success, state), key=lambda pair: pair[0])
-        return best[1].params, int(best[1].step)
+            for _ in range(config.train.eval_every // every):
+                state, metrics = trainer.run(state, repeated, batch_key, every)
+            trials = evaluator.run_trials(trainer.env, trainer.method, state.params, validation, evaluation, key)
+            success, step = float(trials.success.mean()), int(state.step)
+            print(f"  {name} {step}: loss {float(metrics['loss']):.3f}, validation {success:.1%}", flush=True)
+            best = max(best, Trained(state.params, step, success), key=lambda trained: trained.validation)
+        return best
 
     def _trainer(self, config: Config) -> Trainer:
-        env = self._once(
-            (config.env_name, config.env.image_shape), lambda: envs.make(config.env_name, config.env.image_shape)
-        )
+        name, image_shape = config.env_name, config.env.image_shape
+        env = self._once(("env", name, image_shape), lambda: envs.make(name, image_shape))
         optimizer = make_optimizer(config.optimizer, config.train.steps)
         make = lambda: Trainer(env, methods.make(config, spec_of(env)), config.train, optimizer)  # noqa: E731
-        return self._once(("trainer", self._key(config)), make)
+        return self._once(("trainer", self._programs(config)), make)
 
-    def _key(self, config: Config) -> str:
-        """All on which the training's programs depend."""
+    def _programs(self, config: Config) -> str:
+        """All on which the compiled programs of training depend."""
         values = config_lib.to_dict(config)
         del values["seed"], values["evaluation"], values["data"]["tasks"]
         return json.dumps(values)
 
+    def _first_tasks(self, config: Config) -> DemoSet:
+        return jax.tree.map(lambda x: x[: config.data.tasks], self._demos(config, "train"))
+
     def _demos(self, config: Config, split: str) -> DemoSet:
-        """Validation and test tasks, or the training tasks of the largest cell with the same seed."""
+        """Validation or test tasks, or the training tasks of the largest cell with the same seed."""
         whole = dataclasses.replace(config, data=dataclasses.replace(config.data, tasks=self.capacity))
         env = self._trainer(config).env
-        what = config.seed if split == "train" else config.evaluation.shots
-        return self._once((config.env_name, split, what), lambda: split_demos(env, whole, split))
+        which = config.seed if split == "train" else config.evaluation.shots
+        return self._once(("demos", config.env_name, split, which), lambda: split_demos(env, whole, split))
 
     def _once(self, key: Any, make: Callable[[], Any]) -> Any:
         if key not in self._made:

@@ -17,10 +17,6 @@ from absl import app, flags
 
 from milx.config import make_config
 
-METHODS = {
-    "reach": ("mil", "contextual", "lstm"),
-    "reach_state": ("mil", "contextual", "lstm", "lstm_attention"),
-}
 LABELS = {"mil": "MIL", "contextual": "contextual", "lstm": "LSTM", "lstm_attention": "LSTM with attention"}
 TITLES = {"reach": "vision", "reach_state": "state"}
 
@@ -28,7 +24,7 @@ _HERE = pathlib.Path(__file__).parent
 _OUT = flags.DEFINE_string("out", str(_HERE / "results" / "figure3"), "Folder of the JSON files.")
 _FIGURE = flags.DEFINE_string("figure", None, "Where to draw; default figure3.png in the folder.")
 _PRESET = flags.DEFINE_string("preset", "fast", "Hyperparameters.")
-_ENVS = flags.DEFINE_list("envs", list(METHODS), "Environments.")
+_ENVS = flags.DEFINE_list("envs", list(cells.METHODS), "Environments.")
 _TASKS = flags.DEFINE_list("tasks", ["50", "150", "500", "1500"], "Training tasks; each must divide the last.")
 _SEEDS = flags.DEFINE_integer("seeds", 2, "Seeds of each cell.")
 _END_SEEDS = flags.DEFINE_integer("end_seeds", 3, "Seeds of the smallest and of the largest.")
@@ -40,7 +36,7 @@ def run_cells() -> None:
     runner = cells.Cells(pathlib.Path(_OUT.value), sizes[-1])
     for env in _ENVS.value:
         for seed in range(max(_SEEDS.value, _END_SEEDS.value)):
-            for method in METHODS[env]:
+            for method in cells.METHODS[env]:
                 for tasks in reversed(sizes):
                     at_end = tasks in (sizes[0], sizes[-1])
                     if seed < (_END_SEEDS.value if at_end else _SEEDS.value):
@@ -54,10 +50,10 @@ def draw(results: list[dict[str, Any]], path: pathlib.Path) -> None:
     groups = collections.defaultdict(list)
     for result in results:
         groups[result["env"], result["method"], result["num_demos_train"]].append(result)
-    names = [env for env in METHODS if any(env == key[0] for key in groups)]
+    names = [env for env in cells.METHODS if any(env == key[0] for key in groups)]
     figure, axes = plt.subplots(1, len(names), figsize=(4.5 * len(names), 3.6), squeeze=False, layout="constrained")
     for axis, env in zip(axes[0], names, strict=True):
-        for method in METHODS[env]:
+        for method in cells.METHODS[env]:
             sizes = sorted(key[2] for key in groups if key[:2] == (env, method))
             cell = [groups[env, method, size] for size in sizes]
             means = [100 * statistics.mean(result["success"] for result in runs) for runs in cell]

@@ -15,18 +15,23 @@ def read_metrics(path: pathlib.Path) -> list[dict[str, Any]]:
 
 
 def learning_curve(metrics: list[dict[str, Any]], evaluation: dict[str, Any], path: pathlib.Path) -> None:
-    """Plots the meta-objective and the validation success over the steps, with floors, ceiling and test result.
+    """Plots the parts of the meta-objective and the validation success, with floors, ceiling and test result.
 
     Args:
-        metrics: lines with "step" and "loss" or "validation_success".
+        metrics: lines with "step" and "action_loss", perhaps "goal_loss", or "validation_success".
         evaluation: the run's evaluation.json.
         path: image file to write.
     """
     figure = Figure(figsize=(10, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2)
-    losses = [(line["step"], line["loss"]) for line in metrics if "loss" in line]
-    left.plot(*zip(*losses, strict=True), color="tab:blue", lw=1)
-    left.set(xlabel="meta-updates", ylabel="loss after adaptation", yscale="log")
+    left.set(xlabel="meta-updates", yscale="log", title="after adaptation")
+    parts = [("action_loss", "squared error of the actions", left, "tab:blue")]
+    if any("goal_loss" in line for line in metrics):
+        parts.append(("goal_loss", "goal: negative log likelihood", left.twinx(), "tab:red"))
+    for name, label, axis, color in parts:
+        values = [(line["step"], line[name]) for line in metrics if name in line]
+        axis.plot(*zip(*values, strict=True), color=color, lw=1)
+        axis.set_ylabel(label, color=color)
     valid = [(line["step"], line["validation_success"]) for line in metrics if "validation_success" in line]
     right.plot(*zip(*valid, strict=True), "o-", color="tab:blue", label="validation")
     low, high = evaluation["wilson95"]

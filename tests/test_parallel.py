@@ -35,8 +35,8 @@ def random_demos(env, num_tasks, num_demos):
 def measure(num_devices, everything):
     """Losses of 50 meta-updates on the first `num_devices` devices; if asked, also trials and planned actions."""
     import jax
-    from conftest import tiny_config
     from jax.sharding import Mesh
+    from tiny import tiny_config
 
     from milx import envs, evaluator, methods, parallel
     from milx.policy import spec_of
@@ -86,7 +86,7 @@ def work(arguments):
     from milx import parallel
 
     parallel.join_hosts(arguments[2], 2, int(arguments[1]))
-    from conftest import QUIET, tiny_config
+    from tiny import QUIET, tiny_config
 
     from milx.run import Run
 

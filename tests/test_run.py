@@ -8,7 +8,7 @@ import time
 import jax
 import numpy as np
 import pytest
-from conftest import QUIET, tiny_config
+from tiny import QUIET, tiny_config
 
 import milx
 from milx import config as config_lib
