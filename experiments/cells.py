@@ -16,12 +16,12 @@ import jax
 import jax.numpy as jnp
 
 from milx import config as config_lib
-from milx import envs, evaluator, methods, results
+from milx import envs, evaluator, methods, platform, results
 from milx.config import Config
 from milx.data import demos as demos_lib
 from milx.data.demos import DemoSet
 from milx.policy import spec_of
-from milx.run import initial_state, split_demos, trial_key
+from milx.run import check_steps, initial_state, split_demos, trial_key
 from milx.trainer import Trainer, make_optimizer
 from milx.types import Params
 
@@ -39,11 +39,13 @@ class Trained(NamedTuple):
         params: its parameters.
         step: after how many meta-updates.
         validation: its success there.
+        seconds: what compiling the training ("compile"; 0 if an earlier cell did), training and validating took.
     """
 
     params: Params
     step: int
     validation: float
+    seconds: dict[str, float]
 
 
 class Cells:
@@ -58,11 +60,28 @@ class Cells:
         self.folder, self.capacity = folder, capacity
         self._made: dict[Any, Any] = {}
 
-    def run(self, name: str, config: Config) -> None:
-        """Trains and evaluates a cell and writes `name`.json; returns at once if there is one."""
+    def is_done(self, name: str, config: Config) -> bool:
+        """Whether the cell has its file.
+
+        Raises:
+            ValueError: if the file is another configuration's; the message shows the difference.
+        """
         path = self.folder / f"{name}.json"
-        if path.is_file():
+        if not path.is_file():
+            return False
+        theirs = config_lib.to_dict(config_lib.from_dict(json.loads(path.read_text())["config"]))
+        if changed := config_lib.differences(theirs, config_lib.to_dict(config)):
+            raise ValueError(f"{path}: holds another cell: {'; '.join(changed)}")
+        return True
+
+    def run(self, name: str, config: Config) -> None:
+        """Trains and evaluates a cell and writes `name`.json; returns at once if that is done.
+
+        Times of demonstrations and baselines count for the cell that was the first to need them.
+        """
+        if self.is_done(name, config):
             return
+        self._check(config)
         clock = [time.perf_counter()]
         trainer, evaluation = self._trainer(config), config.evaluation
         env, train, test = trainer.env, self._first_tasks(config), self._demos(config, "test")
@@ -76,39 +95,69 @@ class Cells:
         trials = evaluator.run_trials(env, trainer.method, trained.params, test, evaluation, trial_key("test"))
         summary = evaluator.summary(trials.success)
         clock.append(time.perf_counter())
-        laps = [later - earlier for earlier, later in itertools.pairwise(clock)]
-        seconds = {"demos": laps[0], "compile": 0.0, "train": laps[1], "evaluate": laps[2], "total": sum(laps)}
+        demos_s, _, evaluate_s = (later - earlier for earlier, later in itertools.pairwise(clock))
+        seconds = {"demos": demos_s, **trained.seconds, "evaluate": trained.seconds["evaluate"] + evaluate_s}
+        seconds["total"] = sum(seconds.values())
         digest = demos_lib.fingerprint(train)
+        result = results.describe(config, env, summary, floors, seconds, trained.step, digest)
+        self.write(name, result | {"validation_success": trained.validation})
+        print(f"{name}: {summary['success']:.1%}, {seconds['total']:.0f} s", flush=True)
+
+    def write(self, name: str, result: dict[str, Any]) -> None:
+        """Writes a cell's file."""
         self.folder.mkdir(parents=True, exist_ok=True)
-        results.write_json(path, results.describe(config, env, summary, floors, seconds, trained.step, digest))
-        print(f"{name}: {summary['success']:.1%} in {sum(laps):.0f} s", flush=True)
+        results.write_json(self.folder / f"{name}.json", result)
 
     def train(self, name: str, config: Config) -> Trained:
         """Meta-trains a cell; what differs in its evaluation only is not trained again.
 
         Raises:
-            ValueError: if the number of tasks does not divide the capacity.
+            ValueError: if the number of tasks does not divide the capacity, or the steps are not whole scans.
         """
-        if self.capacity % config.data.tasks:
-            raise ValueError(f"data.tasks: got {config.data.tasks}, expected a divisor of {self.capacity}")
+        self._check(config)
         return self._once(
             ("trained", self._programs(config), config.seed, config.data.tasks), lambda: self._train(name, config)
         )
 
+    def _check(self, config: Config) -> None:
+        if self.capacity % config.data.tasks:
+            raise ValueError(f"data.tasks: got {config.data.tasks}, expected a divisor of {self.capacity}")
+        check_steps(config)
+
     def _train(self, name: str, config: Config) -> Trained:
         trainer, train, every = self._trainer(config), self._first_tasks(config), config.train.log_every
-        validation, evaluation, key = self._demos(config, "validation"), config.evaluation, trial_key("validation")
-        state, batch_key = initial_state(trainer, config, train)
+        evaluation = dataclasses.replace(config.evaluation, shots=config.train.shots)
+        validation = self._demos(dataclasses.replace(config, evaluation=evaluation), "validation")
         repeated = jax.tree.map(lambda x: jnp.concatenate([x] * (self.capacity // config.data.tasks)), train)
-        best = Trained(state.params, 0, -1.0)
-        while int(state.step) < config.train.steps:
-            for _ in range(config.train.eval_every // every):
-                state, metrics = trainer.run(state, repeated, batch_key, every)
-            trials = evaluator.run_trials(trainer.env, trainer.method, state.params, validation, evaluation, key)
-            success, step = float(trials.success.mean()), int(state.step)
-            print(f"  {name} {step}: loss {float(metrics['loss']):.3f}, validation {success:.1%}", flush=True)
-            best = max(best, Trained(state.params, step, success), key=lambda trained: trained.validation)
-        return best
+        state, key = initial_state(trainer, config, repeated)
+        seconds, began = dict.fromkeys(("compile", "train", "evaluate"), 0.0), time.perf_counter()
+
+        def lap(name: str) -> None:
+            nonlocal began
+            now = time.perf_counter()
+            seconds[name] += now - began
+            began = now
+
+        compiled = self._once(
+            ("compiled", self._programs(config)),
+            lambda: Trainer.run.lower(trainer, state, repeated, key, every).compile(platform.pixel_options()),
+        )
+        lap("compile")
+        best, step = (state.params, 0, -1.0), 0
+        while step < config.train.steps:
+            state, metrics = compiled(state, repeated, key)
+            step += every
+            if step % config.train.eval_every == 0 or step == config.train.steps:
+                loss = float(metrics["loss"])
+                lap("train")
+                trials = evaluator.run_trials(
+                    trainer.env, trainer.method, state.params, validation, evaluation, trial_key("validation")
+                )
+                success = float(trials.success.mean())
+                lap("evaluate")
+                print(f"  {name} {step}: loss {loss:.3f}, validation {success:.1%}", flush=True)
+                best = max(best, (state.params, step, success), key=lambda entry: entry[2])
+        return Trained(*best, seconds)
 
     def _trainer(self, config: Config) -> Trainer:
         name, image_shape = config.env_name, config.env.image_shape

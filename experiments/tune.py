@@ -10,7 +10,8 @@ import pathlib
 import cells
 from absl import app, flags
 
-from milx import provenance, results
+from milx import config as config_lib
+from milx import provenance
 from milx.config import Config, make_config
 
 RATES = (3e-4, 1e-3, 3e-3)
@@ -33,7 +34,6 @@ def configure(env: str, method: str, rate: float) -> Config:
 def main(_: list[str]) -> None:
     """Runs what is missing and prints a table."""
     folder = pathlib.Path(_OUT.value)
-    folder.mkdir(parents=True, exist_ok=True)
     print(
         "| environment | method | " + " | ".join(f"{rate:g}" for rate in RATES) + " |",
         "|---|---|---|---|---|",
@@ -44,11 +44,17 @@ def main(_: list[str]) -> None:
         for method in cells.METHODS[env]:
             for rate in RATES:
                 name = f"{env}-{method}-{rate:g}"
-                if not (folder / f"{name}.json").is_file():
-                    trained = runner.train(name, configure(env, method, rate))
-                    row = {"env": env, "method": method, "preset": _PRESET.value, "learning_rate": rate}
-                    row |= {"steps": trained.step, "validation_success": trained.validation}
-                    results.write_json(folder / f"{name}.json", row | provenance.describe())
+                config = configure(env, method, rate)
+                if not runner.is_done(name, config):
+                    trained = runner.train(name, config)
+                    row = {
+                        "env": env,
+                        "method": method,
+                        "learning_rate": rate,
+                        "validation_success": trained.validation,
+                    }
+                    row |= {"config": config_lib.to_dict(config), "wall_clock_s": trained.seconds}
+                    runner.write(name, row | provenance.describe())
             found = cells.read(folder)
             shown = [f"{found[f'{env}-{method}-{rate:g}']['validation_success']:.1%}" for rate in RATES]
             print(f"| {env} | {method} | {' | '.join(shown)} |", flush=True)

@@ -61,6 +61,7 @@ class NetworkConfig:
         goal_head: predict where the episode ends, from the image, and show the prediction to the layers after it
             (`milx.networks.goal`).
         context: size of the vector that methods without adaptation keep of a demonstration: units of the LSTM.
+        context_frames: time steps of a demonstration that an LSTM reads.
     """
 
     filters: tuple[int, ...] = (40, 40, 40)
@@ -76,11 +77,12 @@ class NetworkConfig:
     heads: int = 1
     goal_head: bool = False
     context: int = 512
+    context_frames: int = 10
 
 
 @dataclasses.dataclass
 class MILConfig:
-    """Meta-imitation learning (paper, Section 4).
+    """Meta-imitation learning (paper, Section 4); the last three hold for all methods.
 
     Attributes:
         inner_steps: gradient steps of an adaptation.
@@ -248,7 +250,7 @@ PRESETS: dict[str, dict[str, Callable[[], Config]]] = {
 """Preset factories by environment and name."""
 
 SUPPORT_FRAMES = {"contextual": 1, "lstm": None, "lstm_attention": None}
-"""Time steps of a demonstration that methods see which do not imitate it: the last one, or all as at test."""
+"""Time steps of a demonstration shown to methods that do not imitate it: the last one, or all, as at test."""
 
 
 def make_config(env: str, method: str = "mil", preset: str = "fast", seed: int = 0) -> Config:

@@ -25,8 +25,9 @@ def define_flags() -> None:
     flags.DEFINE_string(
         "preset",
         None,
-        "Hyperparameters: paper (as published), fast (the best for an accelerator, its default), cpu (smaller images "
-        "and networks; the default without an accelerator). --config.path.to.field=value changes any of them.",
+        "Hyperparameters: paper (as published; not for reach_state), fast (for an accelerator, its default), cpu "
+        "(smaller images and networks; the default without an accelerator). --config.path.to.field=value changes any "
+        "of them.",
     )
     flags.DEFINE_integer("seed", 0, "Seed of training tasks, initial parameters and batches.", lower_bound=0)
     flags.DEFINE_string(

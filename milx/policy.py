@@ -52,14 +52,15 @@ class Policy:
 
         Args:
             params: `policy.params`.
-            demo: images [.., T, H, W, 3] uint8, states [.., T, S] and actions [.., T, A], NumPy or JAX.
+            demo: images [.., T, H, W, 3] uint8 (None for a policy that sees no pixels), states [.., T, S] and actions
+                [.., T, A], NumPy or JAX.
 
         Returns:
             task_params for `act`.
 
         Raises:
-            ValueError: for a field that is missing or has a wrong shape or type, a value that is not finite, or an
-                action that the environment does not allow.
+            ValueError: for a field that is missing, not wanted, or of a wrong shape or type, a value that is not
+                finite, or an action that the environment does not allow.
         """
         return self._adapt(params, check_demo(demo, self.spec))
 

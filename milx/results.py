@@ -19,7 +19,17 @@ def describe(
     step: int,
     dataset_hash: str,
 ) -> dict[str, Any]:
-    """A result as its JSON file holds it: what was run, what came out, what it took, and where."""
+    """A result as its JSON file holds it: what was run, what came out, what it took, and where.
+
+    Args:
+        config: what was run.
+        env: its environment.
+        summary: trials, success and wilson95.
+        floors: success rates of the baselines in the same trials.
+        seconds: wall-clock by part.
+        step: meta-updates of the checkpoint that was evaluated.
+        dataset_hash: `fingerprint` of the training demonstrations.
+    """
     return {
         "env": config.env_name,
         "method": config.method_name,

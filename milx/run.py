@@ -8,6 +8,7 @@ learning_curve.png, rollouts.gif
 """
 
 import contextlib
+import functools
 import json
 import pathlib
 import tempfile
@@ -55,12 +56,24 @@ def trial_key(split: str) -> jax.Array:
     return jax.random.fold_in(jax.random.key(EVALUATION_SEED), len(envs.SPLITS) + envs.SPLITS.index(split))
 
 
+def check_steps(config: Config) -> None:
+    """Raises ValueError unless training and validation come after whole numbers of scans."""
+    for name in ("steps", "eval_every"):
+        value, scan = getattr(config.train, name), config.train.log_every
+        if value < 1 or value % scan:
+            raise ValueError(f"train.{name}: got {value}, expected a positive multiple of train.log_every = {scan}")
+
+
 def initial_state(trainer: Trainer, config: Config, train: DemoSet) -> tuple[TrainState, jax.Array]:
     """The state before the first meta-update on these demonstrations, and the key of the batches."""
     init_key, batch_key = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), 3))
-    seen = jax.jit(jax.vmap(jax.vmap(jax.vmap(trainer.env.robot_state))))(train.states)
-    statistics = whitening.fit(seen, train.action, config.mil.whiten_actions)
-    return jax.jit(trainer.init)(init_key, statistics), batch_key
+    statistics = whitening.fit(_robot_states(trainer.env, train.states), train.action, config.mil.whiten_actions)
+    return trainer.init(init_key, statistics), batch_key
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _robot_states(env: envs.Env, states: State) -> jax.Array:
+    return jax.vmap(jax.vmap(jax.vmap(env.robot_state)))(states)
 
 
 class Run:
@@ -87,10 +100,7 @@ class Run:
         if config.data.demos_per_task <= config.train.shots:
             expected = f"more than train.shots = {config.train.shots}: another one is the query"
             raise ValueError(f"data.demos_per_task: got {config.data.demos_per_task}, expected {expected}")
-        for name in ("steps", "eval_every"):
-            value, scan = getattr(config.train, name), config.train.log_every
-            if value < 1 or value % scan:
-                raise ValueError(f"train.{name}: got {value}, expected a positive multiple of train.log_every = {scan}")
+        check_steps(config)
         if config.train.meta_batch % parallel.num_devices():
             expected = f"a multiple of the {parallel.num_devices()} devices"
             raise ValueError(f"train.meta_batch: got {config.train.meta_batch}, expected {expected}")

@@ -62,6 +62,7 @@ class Trainer:
     train: TrainConfig
     optimizer: optax.GradientTransformation
 
+    @functools.partial(jax.jit, static_argnums=0)
     def init(self, key: jax.Array, whitening: Whitening) -> TrainState:
         """The state before the first meta-update."""
         params = self.method.init(key, whitening)

@@ -27,7 +27,7 @@ class Observation:
 
     Attributes:
         image: [H, W, 3] uint8, RGB; None where the policy sees no pixels.
-        state: [S] float32, the robot's own state in its natural units.
+        state: [S] float32, the robot's own state in its natural units, and the objects' where there is no image.
     """
 
     image: Array = None
@@ -40,7 +40,7 @@ class Demo:
     """One demonstration, or several with leading axes such as `[N, K]`.
 
     Attributes:
-        image: [T, H, W, 3] uint8, RGB.
+        image: [T, H, W, 3] uint8, RGB; None where policies see no pixels.
         state: [T, S] float32; None when the demonstration has no states.
         action: [T, A] float32; None when the demonstration has no actions.
     """

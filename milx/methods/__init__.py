@@ -55,9 +55,9 @@ def _make_lstm(config: Config, spec: Spec) -> Method:
 
 
 def _make_lstm_attention(config: Config, spec: Spec) -> Method:
-    if not spec.object_indices or spec.image_shape is not None:
+    if not spec.object_indices:
         raise ValueError(
-            "method: got 'lstm_attention' where policies see pixels, expected a state that tells the objects"
+            "method: got 'lstm_attention', expected another: the state does not tell where the objects are"
         )
     actor = AttentiveActor(config.network, spec.action_size, spec.object_indices)
     return _with_context(config, spec, ObjectTokens(config.network, spec.object_indices), actor)
@@ -85,8 +85,11 @@ def make(config: Config, spec: Spec) -> Method:
     """Builds the method that `config.method_name` names.
 
     Raises:
-        ValueError: for a name that does not exist; the message lists those that do.
+        ValueError: for a name that does not exist (the message lists those that do), a method that needs to be told
+            where the objects are and is not, or a goal head where the policy sees no pixels.
     """
     if config.method_name not in METHODS:
         raise ValueError(f"method: got {config.method_name!r}, expected one of {', '.join(METHODS)}")
+    if config.network.goal_head and spec.image_shape is None:
+        raise ValueError("network.goal_head: got True, expected False: this policy sees no pixels")
     return METHODS[config.method_name](config, spec)

@@ -24,18 +24,19 @@ def split_objects(state: jax.Array, object_indices: tuple[tuple[int, ...], ...])
 
 
 class ObjectTokens(nn.Module):
-    """Embeds every object at every time step: its place, its number, and what the robot is and does then."""
+    """Embeds every object at every time step: its place, its number, the time, and what the robot is and does then."""
 
     config: NetworkConfig
     object_indices: tuple[tuple[int, ...], ...]
 
     @nn.compact
-    def __call__(self, image: None, state: jax.Array, action: jax.Array) -> jax.Array:
-        """Maps whitened states [T, S] and actions [T, A] to tokens [T, O, D]; there must be no image."""
+    def __call__(self, image: jax.Array | None, state: jax.Array, action: jax.Array) -> jax.Array:
+        """Maps whitened states [T, S] and actions [T, A] to tokens [T, O, D]; an image is not looked at."""
         places, robot = split_objects(state, self.object_indices)
         steps, count = places.shape[:2]
         number = jnp.broadcast_to(jnp.eye(count, dtype=state.dtype), (steps, count, count))
-        seen = jnp.concatenate([robot, action], axis=-1)
+        time = jnp.linspace(0, 1, steps, dtype=state.dtype)[:, None]
+        seen = jnp.concatenate([robot, action, time], axis=-1)
         seen = jnp.broadcast_to(seen[:, None], (steps, count, seen.shape[-1]))
         x = jnp.concatenate([places, number, seen], axis=-1).reshape(steps * count, -1)
         for size in (self.config.fc_layers[0], self.config.fc_layers[0]):
@@ -51,8 +52,8 @@ class AttentiveActor(nn.Module):
     object_indices: tuple[tuple[int, ...], ...]
 
     @nn.compact
-    def __call__(self, tokens: jax.Array, image: None, state: jax.Array) -> PolicyOutput:
-        """Maps tokens [T, O, D] and whitened states [B, S] to actions."""
+    def __call__(self, tokens: jax.Array, image: jax.Array | None, state: jax.Array) -> PolicyOutput:
+        """Maps tokens [T, O, D] and whitened states [B, S] to actions; an image is not looked at."""
         places, robot = split_objects(state, self.object_indices)
         batch, count = places.shape[:2]
         size = tokens.shape[-1]

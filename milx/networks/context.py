@@ -1,7 +1,7 @@
 """Policies that turn a demonstration into a vector once, and see that vector while they act (paper, Section 6).
 
-*Contextual*: the vector comes from the demonstration's last frame. *LSTM*: a recurrent network reads all frames, with
-states and actions. The network that acts is the same for both, and MIL's but for the vector.
+*Contextual*: the vector comes from the demonstration's last frame. *LSTM*: a recurrent network reads frames from the
+first to the last, with states and actions. The network that acts is the same for both, and MIL's but for the vector.
 """
 
 from collections.abc import Callable
@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from milx.config import NetworkConfig
 from milx.networks.layers import Dense
@@ -48,16 +49,20 @@ class LastFrame(nn.Module):
 
 
 class Recurrent(nn.Module):
-    """The context [D] is an LSTM's output after the last of all frames (Hochreiter and Schmidhuber 1997)."""
+    """The context [D] is an LSTM's output after the last frame (Hochreiter and Schmidhuber 1997).
+
+    It reads `config.context_frames` of them, spread evenly from the first to the last.
+    """
 
     config: NetworkConfig
 
     @nn.compact
     def __call__(self, image: jax.Array | None, state: jax.Array, action: jax.Array) -> jax.Array:
         """See `ContextNetwork.encode`."""
-        parts = [state, action]
+        index = np.linspace(0, len(state) - 1, min(len(state), self.config.context_frames)).round().astype(int)
+        parts = [state[index], action[index]]
         if image is not None:
-            features = ConvStack(self.config, name="vision")(image, state.dtype)
+            features = ConvStack(self.config, name="vision")(image[index], state.dtype)
             flat = features.reshape(len(features), -1)
             parts.append(Dense(self.config.fc_layers[0], hidden=True, norm=self.config.fc_norm)(flat))
         cell = nn.OptimizedLSTMCell(self.config.context, param_dtype=state.dtype)

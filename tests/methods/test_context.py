@@ -16,25 +16,31 @@ from milx.whitening import Whitening
 
 IMAGE_SHAPE, STATE, ACTION, STEPS = (8, 10), 7, 2, 5
 OBJECTS = ((1, 2), (3, 4), (5, 6))
-VISION, FROM_STATE = ("mil", "contextual", "lstm"), ("lstm_attention",)
+CASES = [(name, True) for name in ("mil", "contextual", "lstm")]
+CASES += [(name, False) for name in ("mil", "contextual", "lstm", "lstm_attention")]
 
 
 @functools.cache
-def build(name):
-    """A tiny method, its parameters, and a whitening that changes nothing."""
-    vision = name in VISION
+def build(name, vision, goal_head=False):
+    """A tiny method that sees pixels or only states, and its parameters; whitening changes nothing."""
     spec = methods.Spec(
         image_shape=IMAGE_SHAPE if vision else None,
         state_size=STATE,
         action_size=ACTION,
         action_range=((-1.0,) * ACTION, (1.0,) * ACTION),
-        goal_indices=(),
+        goal_indices=(1, 2) if goal_head else (),
+        image_to_goal=((0.5, 0.0), (0.0, -0.5), (0.1, 0.2)) if goal_head else None,
         object_indices=() if vision else OBJECTS,
     )
     network = NetworkConfig(
-        filters=(4,) * vision, strides=(2,) * vision, fc_layers=(16, 16), bias_transformation=4, context=8
+        filters=(4,) * vision,
+        strides=(2,) * vision,
+        fc_layers=(16, 16),
+        bias_transformation=4,
+        context=8,
+        goal_head=goal_head,
     )
-    config = Config(network=network, mil=MILConfig(inner_lr=0.1, learn_inner_lr=True))
+    config = Config(network=network, mil=MILConfig(inner_lr=0.1, learn_inner_lr=True, goal_weight=1.0))
     method = methods.make(dataclasses.replace(config, method_name=name), spec)
     zeros, ones = (fill((size,)) for fill, size in ((jnp.zeros, STATE), (jnp.ones, STATE)))
     whitening = Whitening(zeros, ones, jnp.zeros(ACTION), jnp.ones(ACTION))
@@ -58,10 +64,10 @@ def two_tasks(vision):
 
 
 @functools.cache
-def trained(name):
+def trained(name, vision):
     """The parameters after they were fitted to the two tasks."""
-    method, params = build(name)
-    batch, optimizer = two_tasks(name in VISION), optax.adam(3e-3)
+    method, params = build(name, vision)
+    batch, optimizer = two_tasks(vision), optax.adam(3e-3)
 
     def update(carry, _):
         params, state = carry
@@ -73,26 +79,26 @@ def trained(name):
     return fit((params, optimizer.init(params)))[0]
 
 
-@pytest.mark.parametrize("name", VISION + FROM_STATE)
-def test_a_method_fits_two_tasks_and_with_swapped_demonstrations_does_the_other(name):
+@pytest.mark.parametrize(("name", "vision"), CASES)
+def test_a_method_fits_two_tasks_and_with_swapped_demonstrations_does_the_other(name, vision):
     """No observation tells the two tasks apart: blind, a policy errs by a quarter of their squared difference.
 
     Fitted, it errs by nothing; told the other task, it does the other, and errs by the whole difference.
     """
-    method, _ = build(name)
-    batch = two_tasks(name in VISION)
+    method, _ = build(name, vision)
+    batch = two_tasks(vision)
     swapped = dataclasses.replace(batch, support=jax.tree.map(lambda x: x[::-1], batch.support))
-    loss = jax.jit(lambda batch: method.loss(trained(name), batch)[0])
+    loss = jax.jit(lambda batch: method.loss(trained(name, vision), batch)[0])
     difference = float(jnp.square(batch.query.action[0] - batch.query.action[1]).mean())
     assert loss(batch) < 0.02 * difference / 4
     np.testing.assert_allclose(loss(swapped), difference, rtol=0.3)
 
 
-@pytest.mark.parametrize("name", VISION + FROM_STATE)
-def test_the_action_is_the_one_that_the_loss_knows(name):
+@pytest.mark.parametrize(("name", "vision"), CASES)
+def test_the_action_is_the_one_that_the_loss_knows(name, vision):
     """`adapt` and `act` outside, `loss` inside: the errors of the acted actions are the loss."""
-    method, params = build(name)
-    batch = two_tasks(name in VISION)
+    method, params = build(name, vision)
+    batch = two_tasks(vision)
 
     @jax.jit
     def error(support, query):
@@ -105,10 +111,10 @@ def test_the_action_is_the_one_that_the_loss_knows(name):
     np.testing.assert_allclose(np.mean(each), method.loss(params, batch)[0], rtol=1e-5)
 
 
-@pytest.mark.parametrize("name", ["contextual", "lstm", "lstm_attention"])
-def test_several_demonstrations_give_the_mean_of_their_actions(name):
-    method, params = build(name)
-    demos = random_demos(np.random.default_rng(1), name in VISION, 3)
+@pytest.mark.parametrize(("name", "vision"), [("contextual", True), ("lstm", False), ("lstm_attention", False)])
+def test_several_demonstrations_give_the_mean_of_their_actions(name, vision):
+    method, params = build(name, vision)
+    demos = random_demos(np.random.default_rng(1), vision, 3)
     seen = jax.tree.map(lambda x: x[0, 0], demos)
     act = jax.jit(lambda demo: method.act(method.adapt(params, demo), Observation(seen.image, seen.state), ())[0])
     each = [act(jax.tree.map(lambda x, k=k: x[k : k + 1], demos)) for k in range(3)]
@@ -119,7 +125,7 @@ def test_several_demonstrations_give_the_mean_of_their_actions(name):
 def test_contextual_policies_see_the_last_frame_only_and_recurrent_ones_all():
     demo = random_demos(np.random.default_rng(2), True, 1)
     for name, frames_seen in (("contextual", [STEPS - 1]), ("lstm", list(range(STEPS)))):
-        method, params = build(name)
+        method, params = build(name, True)
         encode = jax.jit(lambda demo, method=method, params=params: method.adapt(params, demo)["context"])
         context = encode(demo)
         changed = [
@@ -127,3 +133,32 @@ def test_contextual_policies_see_the_last_frame_only_and_recurrent_ones_all():
             for t in range(STEPS)
         ]
         assert [t for t in range(STEPS) if changed[t] > 1e-6] == frames_seen, name
+
+
+@pytest.mark.parametrize("name", ["contextual", "lstm"])
+def test_the_context_tells_the_goal_head_what_to_look_for_among_calibrated_votes(name):
+    method, params = build(name, True, goal_head=True)
+    demos = random_demos(np.random.default_rng(3), True, 2, 1)
+    seen = jax.tree.map(lambda x: x[0, 0], demos)
+
+    @jax.jit
+    def goal(demo):
+        context = jax.tree.map(lambda x: x[0], method.adapt(params, demo)["context"])
+        return method.network.apply(params, context, seen.image, seen.state).goal
+
+    goals = [goal(jax.tree.map(lambda x, k=k: x[k], demos)) for k in range(2)]
+    assert jnp.abs(jnp.exp(goals[0].log_weight) - jnp.exp(goals[1].log_weight)).max() > 1e-3
+    # Centres of the four by five cells, through the calibration.
+    x, y = np.meshgrid([-0.8, -0.4, 0, 0.4, 0.8], [-0.75, -0.25, 0.25, 0.75])
+    expected = np.stack([0.5 * x.ravel() + 0.1, -0.5 * y.ravel() + 0.2], axis=-1)
+    np.testing.assert_allclose(goals[0].vote, expected, atol=1e-6)
+
+
+def test_what_does_not_fit_together_is_refused():
+    spec = methods.Spec(None, STATE, ACTION, ((-1.0,) * ACTION, (1.0,) * ACTION), goal_indices=(1,))
+    config = Config(method_name="lstm_attention", network=NetworkConfig(filters=(), strides=()))
+    with pytest.raises(ValueError, match="method: got 'lstm_attention', expected another: the state does not tell"):
+        methods.make(config, spec)
+    config = Config(network=NetworkConfig(filters=(), strides=(), goal_head=True))
+    with pytest.raises(ValueError, match=r"network\.goal_head: got True, expected False: this policy sees no pixels"):
+        methods.make(config, spec)
