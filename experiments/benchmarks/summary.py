@@ -10,6 +10,7 @@ import sys
 import matplotlib.pyplot as plt
 from matplotlib.ticker import NullFormatter
 
+PEERS = ("PyTorch", "JAX, vmap", "MJX", "mujoco", "mapped jvp")
 FOLDER = pathlib.Path(__file__).parents[1] / "results" / "benchmarks"
 
 
@@ -30,19 +31,21 @@ def table(results: list[dict]) -> str:
 
 
 def draw(results: list[dict], path: pathlib.Path) -> None:
-    """One panel of bars for every file, what was not run left out."""
+    """One panel of bars for every file, what was not run left out; peers are gray."""
     figure, axes = plt.subplots(len(results), 1, figsize=(9, 2.2 * len(results)), squeeze=False, layout="constrained")
     for axis, result in zip(axes[:, 0], results, strict=True):
         rows = [row for row in result["rows"] if row["median"] is not None]
         labels = [f"{row['name']} ({row['unit']})" for row in rows]
-        bars = axis.barh(labels, [row["median"] for row in rows], color="tab:blue")
-        axis.bar_label(bars, [f" {row['median']:,.3g}" for row in rows], fontsize=6)
-        axis.set(xscale="log", title=f"{result['benchmark']}, {result['hardware']}")
+        medians = [row["median"] for row in rows]
+        peers = [any(peer in row["name"] for peer in PEERS) for row in rows]
+        bars = axis.barh(labels, medians, color=["0.7" if peer else "tab:blue" for peer in peers])
+        axis.bar_label(bars, [f" {median:,.3g}" for median in medians], fontsize=6)
+        axis.set(xscale="log", xlim=(min(medians) / 3, max(medians) * 3))
+        axis.set_title(f"{result['benchmark']}, {result['hardware']}")
         axis.invert_yaxis()
         axis.xaxis.set_minor_formatter(NullFormatter())
         axis.tick_params(labelsize=6)
         axis.title.set_fontsize(8)
-        axis.margins(x=0.15)
     figure.savefig(path, dpi=150)
     plt.close(figure)
 
