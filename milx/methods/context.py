@@ -67,8 +67,7 @@ class ContextPolicy(Method):
 
     def act(self, task_params: Params, observation: Observation, memory: Memory) -> tuple[jax.Array, Memory]:
         """The mean over the contexts of the actor's action."""
-        whitening = task_params["whitening"]
-        image = None if observation.image is None else observation.image[None]
-        state = whitening.state(observation.state)[None]
-        apply = jax.vmap(lambda context: self.network.apply(task_params, context, image, state).action[0])
+        whitening, batch = task_params["whitening"], jax.tree.map(lambda x: x[None], observation)
+        state = whitening.state(batch.state)
+        apply = jax.vmap(lambda context: self.network.apply(task_params, context, batch.image, state).action[0])
         return whitening.unwhiten_action(apply(task_params["context"]).mean(axis=0)), memory

@@ -105,10 +105,8 @@ class MIL(Method):
 
     def act(self, task_params: Params, observation: Observation, memory: Memory) -> tuple[jax.Array, Memory]:
         """The adapted network's action for one observation."""
-        whitening = task_params["whitening"]
-        state = whitening.state(observation.state)
-        image = None if observation.image is None else observation.image[None]
-        output = self.network.apply(task_params["policy"], image, state[None])
+        whitening, batch = task_params["whitening"], jax.tree.map(lambda x: x[None], observation)
+        output = self.network.apply(task_params["policy"], batch.image, whitening.state(batch.state))
         return whitening.unwhiten_action(output.action[0]), memory
 
     def _inner_loss(self, theta: Params, whitening: Whitening, demo: Demo) -> jax.Array:
