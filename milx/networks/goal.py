@@ -60,9 +60,10 @@ class GoalHead(nn.Module):
         """`query` [B, C] is added to the filter."""
         batch, height, width, channels = features.shape
         kernel = self.param("kernel", nn.initializers.normal(channels**-0.5), (channels,))
-        heat = features.reshape(batch, height * width, channels) @ kernel
+        features = features.reshape(batch, height * width, channels)
+        heat = features @ kernel
         if query is not None:
-            heat += jnp.einsum("bpc,bc->bp", features.reshape(batch, -1, channels), query)
+            heat += jnp.einsum("bpc,bc->bp", features, query)
         # The image reaches from -1 to 1: half a cell beyond the centres of the outermost.
         centre = positions(height, width) * (1 - 1 / jnp.array([width, height]))
         place = jnp.append(centre, jnp.ones((height * width, 1)), axis=-1)
