@@ -1,7 +1,7 @@
 """Figure 3 of the paper: success against the number of training demonstrations, from pixels and from states.
 
     python experiments/figure3.py                    # what is missing, then the figure
-    python experiments/figure3.py --preset=cpu --out=/tmp/figure3 --tasks=6,12 --seeds=1
+    python experiments/figure3.py --preset=cpu --out=tiny --tasks=6,12 --seeds=1
 
 Stopped and started again it goes on with the next cell. Scenes are not redrawn (`train.redraw`): a small set is to be
 small in colours and places, too.
