@@ -12,7 +12,7 @@ import cells
 from absl import app, flags
 
 from milx import config as config_lib
-from milx.config import Config, make_config
+from milx.config import Config
 
 ABLATIONS: dict[str, dict[str, Any]] = {
     "as it is": {},
@@ -29,12 +29,13 @@ ABLATIONS: dict[str, dict[str, Any]] = {
 _HERE = pathlib.Path(__file__).parent
 _OUT = flags.DEFINE_string("out", str(_HERE / "results" / "ablations"), "Folder of the JSON files.")
 _PRESET = flags.DEFINE_string("preset", "fast", "Hyperparameters of all that is not changed.")
+_STEPS = flags.DEFINE_integer("steps", cells.STEPS["reach"], "Meta-updates of each.")
 _SEEDS = flags.DEFINE_integer("seeds", 2, "Seeds of each.")
 
 
 def configure(changes: dict[str, Any], seed: int) -> Config:
-    """The preset with some fields, by dotted name, changed."""
-    config = make_config("reach", preset=_PRESET.value, seed=seed)
+    """A cell of figure 3 with some fields, by dotted name, changed."""
+    config = cells.configure("reach", "mil", _PRESET.value, seed, _STEPS.value)
     for name, value in changes.items():
         config_lib.assign(config, name, value)
     return config

@@ -1,10 +1,9 @@
 """Figure 3 of the paper: success against the number of training demonstrations, from pixels and from states.
 
     python experiments/figure3.py                    # what is missing, then the figure
-    python experiments/figure3.py --preset=cpu --out=tiny --tasks=6,12 --seeds=1
+    python experiments/figure3.py --preset=cpu --steps=200 --out=tiny --tasks=6,12 --seeds=1 --end_seeds=1
 
-Stopped and started again it goes on with the next cell. Scenes are not redrawn (`train.redraw`): a small set is to be
-small in colours and places, too.
+Stopped and started again it goes on with the next cell.
 """
 
 import collections
@@ -16,8 +15,6 @@ import cells
 import matplotlib.pyplot as plt
 from absl import app, flags
 
-from milx.config import make_config
-
 LABELS = {"mil": "MIL", "contextual": "contextual", "lstm": "LSTM", "lstm_attention": "LSTM with attention"}
 TITLES = {"reach": "vision, held-out colours", "reach_state": "state, held-out scenes"}
 
@@ -26,6 +23,8 @@ _OUT = flags.DEFINE_string("out", str(_HERE / "results" / "figure3"), "Folder of
 _FIGURE = flags.DEFINE_string("figure", None, "Where to draw; default figure3.png in the folder.")
 _PRESET = flags.DEFINE_string("preset", "fast", "Hyperparameters.")
 _ENVS = flags.DEFINE_list("envs", list(cells.METHODS), "Environments.")
+_METHODS = flags.DEFINE_list("methods", None, "Methods; default all.")
+_STEPS = flags.DEFINE_integer("steps", None, "Meta-updates of every cell; default 16,000, or 4,000 from states.")
 _TASKS = flags.DEFINE_list("tasks", ["50", "150", "500", "1500"], "Training tasks; each must divide the last.")
 _SEEDS = flags.DEFINE_integer("seeds", 2, "Seeds of each cell.")
 _END_SEEDS = flags.DEFINE_integer("end_seeds", 3, "Seeds of the smallest and of the largest.")
@@ -37,12 +36,12 @@ def run_cells() -> None:
     runner = cells.Cells(pathlib.Path(_OUT.value), sizes[-1])
     for env in _ENVS.value:
         for seed in range(max(_SEEDS.value, _END_SEEDS.value)):
-            for method in cells.METHODS[env]:
+            for method in _METHODS.value or cells.METHODS[env]:
                 for tasks in reversed(sizes):
                     at_end = tasks in (sizes[0], sizes[-1])
                     if seed < (_END_SEEDS.value if at_end else _SEEDS.value):
-                        config = make_config(env, method, _PRESET.value, seed)
-                        config.data.tasks, config.train.redraw = tasks, False
+                        config = cells.configure(env, method, _PRESET.value, seed, _STEPS.value or cells.STEPS[env])
+                        config.data.tasks = tasks
                         runner.run(f"{env}-{method}-{tasks}-{seed}", config)
 
 

@@ -1,4 +1,4 @@
-"""Learning rates of every method on reach, by success on validation tasks: the same few candidates for each.
+"""Learning rate and schedule of every method on reach, by success on validation tasks: the same candidates for each.
 
     python experiments/tune.py        # what is missing, then the table
 
@@ -6,6 +6,7 @@ Test tasks are not looked at.
 """
 
 import pathlib
+from typing import Any
 
 import cells
 from absl import app, flags
@@ -14,49 +15,47 @@ from milx import config as config_lib
 from milx import provenance
 from milx.config import Config, make_config
 
-RATES = (3e-4, 1e-3, 3e-3)
+CANDIDATES = {
+    "3e-4": (3e-4, True),
+    "1e-3": (1e-3, True),
+    "3e-3": (3e-3, True),
+    "1e-3, constant": (1e-3, False),
+}
+"""Learning rate, and whether it decays to zero along a cosine."""
 
 _HERE = pathlib.Path(__file__).parent
 _OUT = flags.DEFINE_string("out", str(_HERE / "results" / "tuning"), "Folder of the JSON files.")
 _PRESET = flags.DEFINE_string("preset", "fast", "Hyperparameters of all that is not changed.")
-_STEPS = flags.DEFINE_integer("steps", 8000, "Meta-updates; the schedule ends with them.")
+_STEPS = flags.DEFINE_integer("steps", None, "Meta-updates; default half of those of figure 3.")
 _ENVS = flags.DEFINE_list("envs", list(cells.METHODS), "Environments.")
+_METHODS = flags.DEFINE_list("methods", None, "Methods; default all.")
 
 
-def configure(env: str, method: str, rate: float) -> Config:
-    """A short run with one validation, at its end."""
-    config = make_config(env, method, _PRESET.value)
-    config.optimizer.learning_rate = rate
-    config.train.steps = config.train.eval_every = _STEPS.value
+def configure(env: str, method: str, candidate: str) -> Config:
+    """A short run, validated at its end only; the schedule ends with it."""
+    config = cells.configure(env, method, _PRESET.value, seed=0, steps=_STEPS.value or cells.STEPS[env] // 2)
+    config.optimizer.learning_rate, config.optimizer.cosine = CANDIDATES[candidate]
+    config.train.eval_every = config.train.steps
     return config
 
 
 def main(_: list[str]) -> None:
     """Runs what is missing and prints a table."""
     folder = pathlib.Path(_OUT.value)
-    print(
-        "| environment | method | " + " | ".join(f"{rate:g}" for rate in RATES) + " |",
-        "|---|---|---|---|---|",
-        sep="\n",
-    )
+    print("| environment | method | " + " | ".join(CANDIDATES) + " |", "|---|---|---|---|---|---|", sep="\n")
     for env in _ENVS.value:
         runner = cells.Cells(folder, make_config(env, preset=_PRESET.value).data.tasks)
-        for method in cells.METHODS[env]:
-            for rate in RATES:
-                name = f"{env}-{method}-{rate:g}"
-                config = configure(env, method, rate)
+        for method in _METHODS.value or cells.METHODS[env]:
+            names = {candidate: f"{env}-{method}-{candidate.replace(', ', '-')}" for candidate in CANDIDATES}
+            for candidate, name in names.items():
+                config = configure(env, method, candidate)
                 if not runner.is_done(name, config):
                     trained = runner.train(name, config)
-                    row = {
-                        "env": env,
-                        "method": method,
-                        "learning_rate": rate,
-                        "validation_success": trained.validation,
-                    }
-                    row |= {"config": config_lib.to_dict(config), "wall_clock_s": trained.seconds}
-                    runner.write(name, row | provenance.describe())
+                    row: dict[str, Any] = {"env": env, "method": method, "candidate": candidate}
+                    row |= {"validation_success": trained.validation, "wall_clock_s": trained.seconds}
+                    runner.write(name, row | {"config": config_lib.to_dict(config)} | provenance.describe())
             found = cells.read(folder)
-            shown = [f"{found[f'{env}-{method}-{rate:g}']['validation_success']:.1%}" for rate in RATES]
+            shown = [f"{found[name]['validation_success']:.1%}" for name in names.values()]
             print(f"| {env} | {method} | {' | '.join(shown)} |", flush=True)
 
 

@@ -17,8 +17,11 @@ from milx.config import OptimizerConfig, TrainConfig
 from milx.data.demos import DemoSet, sample_batch
 from milx.envs.base import Env
 from milx.methods.base import Method
-from milx.types import Array, Params
+from milx.types import Array, Params, TaskBatch
 from milx.whitening import Whitening
+
+_CPU_IMAGES = 100
+"""Images of a meta-batch that a CPU works on at once, if that makes a task or more."""
 
 
 @jax.tree_util.register_dataclass
@@ -44,6 +47,25 @@ def make_optimizer(config: OptimizerConfig, steps: int) -> optax.GradientTransfo
     rate = optax.join_schedules([optax.linear_schedule(0.0, peak, max(warmup, 1)), then], [warmup])
     clip = optax.identity() if config.clip_norm is None else optax.clip_by_global_norm(config.clip_norm)
     return optax.chain(clip, optax.adam(rate))
+
+
+def meta_gradient(method: Method, params: Params, batch: TaskBatch) -> tuple[Params, dict[str, jax.Array]]:
+    """The gradient of `method.loss`, and its metrics, "loss" among them.
+
+    A CPU works on a few tasks at a time, so that what they need stays in its cache.
+    """
+
+    def gradient(batch: TaskBatch) -> tuple[Params, dict[str, jax.Array]]:
+        (loss, metrics), grad = jax.value_and_grad(method.loss, has_aux=True)(params, batch)
+        return grad, {"loss": loss, **metrics}
+
+    images = [demo.image for demo in (batch.support, batch.query) if demo.image is not None]
+    at_once = _CPU_IMAGES // max(1, sum(image.shape[1] * image.shape[2] for image in images))
+    if jax.default_backend() != "cpu" or at_once >= len(batch.query.action):
+        return gradient(batch)
+    one_task = lambda task: gradient(jax.tree.map(lambda x: x[None], task))  # noqa: E731
+    each = jax.lax.map(one_task, batch, batch_size=max(1, at_once))
+    return jax.tree.map(lambda x: x.mean(axis=0), each)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -75,8 +97,7 @@ class Trainer:
             train = self.train
             frames = train.support_frames, train.query_frames
             batch = sample_batch(self.env, demos, keys, train.shots, *frames, train.redraw)
-            (loss, metrics), grad = jax.value_and_grad(self.method.loss, has_aux=True)(params, batch)
-            return grad, {"loss": loss, **metrics}
+            return meta_gradient(self.method, params, batch)
 
         keys = jax.random.split(jax.random.fold_in(key, state.step), self.train.meta_batch)
         grad, metrics = parallel.split_tasks(gradient, shared=2, average=True)(state.params, demos, keys)

@@ -11,7 +11,9 @@ import os
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # PyTorch needs memory in the same process
 
 import dataclasses
+import functools
 import pathlib
+from collections.abc import Callable
 from typing import Any
 
 import common
@@ -24,9 +26,11 @@ from absl import app, flags
 from milx import envs, methods, platform
 from milx.config import Config, make_config
 from milx.envs.base import Env
+from milx.methods.base import Method
 from milx.networks import layers
 from milx.policy import spec_of
-from milx.types import TaskBatch
+from milx.trainer import meta_gradient
+from milx.types import Params, TaskBatch
 
 _OUT = flags.DEFINE_string("out", str(common.RESULTS), "Folder of the JSON file.")
 _TASKS = flags.DEFINE_integer("tasks", None, "Tasks in a meta-batch; the paper's by default.")
@@ -41,12 +45,19 @@ def domain(name: str) -> tuple[Config, Env]:
     return make_config("reach", preset="paper"), envs.make("reach")
 
 
-def compile_gradient(config: Config, env: Env, batch: TaskBatch) -> tuple[jax.stages.Compiled, Any]:
-    """The meta-gradient of milx, compiled, and parameters for it."""
+def compile_gradient(
+    config: Config, env: Env, batch: TaskBatch, gradient: Callable[..., Any] = meta_gradient
+) -> tuple[jax.stages.Compiled, Any]:
+    """The meta-gradient, compiled, and parameters for it."""
     method = methods.make(config, spec_of(env))
     params = method.init(jax.random.key(0), workload.unit_whitening(env))
-    gradient = jax.jit(jax.grad(lambda params, batch: method.loss(params, batch)[0]))
-    return gradient.lower(params, batch).compile(platform.pixel_options()), params
+    jitted = jax.jit(functools.partial(gradient, method))
+    return jitted.lower(params, batch).compile(platform.pixel_options()), params
+
+
+def vmapped_gradient(method: Method, params: Params, batch: TaskBatch) -> Params:
+    """All tasks at once, on a CPU too."""
+    return jax.grad(method.loss, has_aux=True)(params, batch)[0]
 
 
 def lax_convolution(x: jax.Array, kernel: jax.Array, stride: int) -> jax.Array:
@@ -128,8 +139,8 @@ def measure_domain(name: str) -> None:
         network = dataclasses.replace(config.network, mixed_precision=mixed, rematerialise=rematerialise)
         return dataclasses.replace(config, network=network)
 
-    def gradient(*changes: bool) -> tuple[float, float]:
-        compiled, params = compile_gradient(variant(*changes), env, batch)
+    def gradient(*changes: bool, by: Callable[..., Any] = meta_gradient) -> tuple[float, float]:
+        compiled, params = compile_gradient(variant(*changes), env, batch, by)
         return common.median_ms(compiled, params, batch, repeats=repeats), common.gib(compiled)
 
     accelerated = common.ACCELERATED
@@ -146,7 +157,9 @@ def measure_domain(name: str) -> None:
     ours, layers.conv2d = layers.conv2d, lax_convolution
     for mixed in (True, False) if accelerated else (False,):
         kind = "bfloat16" if mixed else "float32"
-        report.attempt(f"JAX, vmap over lax.conv, {kind}", "ms", lambda mixed=mixed: gradient(mixed))
+        report.attempt(
+            f"JAX, vmap over lax.conv, {kind}", "ms", lambda mixed=mixed: gradient(mixed, by=vmapped_gradient)
+        )
     layers.conv2d = ours
     for mode, bf16 in (("loop", False), ("vmap", False), ("vmap", True), ("compile", False), ("compile", True)):
         kind = "bfloat16" if bf16 else "float32"

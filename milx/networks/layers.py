@@ -129,13 +129,63 @@ class SpatialSoftArgmax(nn.Module):
         return spatial_soft_argmax(features, jnp.exp(log_temperature))
 
 
-def centred_layer_norm(x: jax.Array, bias: jax.Array) -> jax.Array:
-    """Layer normalisation over all axes but the first, with a learned centre and no learned scale."""
+def layer_norm(x: jax.Array) -> jax.Array:
+    """Zero mean and unit variance over all axes but the first; nothing learned."""
     axes = tuple(range(1, x.ndim))
     # The variance as flax computes it, from sums that one pass over the input gives.
     mean, square = x.mean(axes, keepdims=True), jnp.square(x).mean(axes, keepdims=True)
     variance = jnp.maximum(square - jnp.square(mean), 0.0)
-    return (x - mean) * jax.lax.rsqrt(variance + 1e-6) + bias
+    return (x - mean) * jax.lax.rsqrt(variance + 1e-6)
+
+
+@jax.custom_vjp
+def add_bias(x: jax.Array, bias: jax.Array) -> jax.Array:
+    """[.., F] plus [F] in the bias's type, with the bias's gradient by `_sum_over_pixels`.
+
+    Like `shifted_relu`, it can be differentiated in reverse, and forward over reverse, but not forward alone.
+    """
+    return x.astype(bias.dtype) + bias
+
+
+def _add_bias_forward(x: jax.Array, bias: jax.Array) -> tuple[jax.Array, jax.Array]:
+    return x.astype(bias.dtype) + bias, jnp.zeros((), x.dtype)
+
+
+def _add_bias_backward(like: jax.Array, gradient: jax.Array) -> tuple[jax.Array, jax.Array]:
+    rounded = gradient.astype(like.dtype)
+    return rounded, _sum_over_pixels(rounded, gradient.dtype)
+
+
+add_bias.defvjp(_add_bias_forward, _add_bias_backward)
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
+def shifted_relu(x: jax.Array, centre: jax.Array, dtype: jnp.dtype) -> jax.Array:
+    """relu([.., F] plus [F]) as `dtype`, with the centre's gradient by `_sum_over_pixels`."""
+    return nn.relu(x + centre).astype(dtype)
+
+
+def _shifted_relu_forward(x: jax.Array, centre: jax.Array, dtype: jnp.dtype) -> tuple[jax.Array, tuple]:
+    y = nn.relu(x + centre).astype(dtype)
+    return y, (y, jnp.zeros((), x.dtype))
+
+
+def _shifted_relu_backward(dtype: jnp.dtype, kept: tuple, gradient: jax.Array) -> tuple[jax.Array, jax.Array]:
+    y, like = kept
+    passed = jnp.where(y > 0, gradient, 0)
+    return passed.astype(like.dtype), _sum_over_pixels(passed, like.dtype)
+
+
+shifted_relu.defvjp(_shifted_relu_forward, _shifted_relu_backward)
+
+
+def _sum_over_pixels(x: jax.Array, dtype: jnp.dtype) -> jax.Array:
+    """[.., F] to [F]. On accelerators by a product with ones: XLA's own sum is slow where so few channels remain."""
+    flat = x.reshape(-1, x.shape[-1])
+    if jax.default_backend() == "cpu":
+        return flat.sum(axis=0, dtype=dtype)
+    ones = jnp.ones((8, len(flat)), x.dtype)  # of a product with a single row XLA would make that sum again
+    return jnp.matmul(ones, flat, precision=jax.lax.Precision.HIGHEST, preferred_element_type=dtype)[0]
 
 
 class ConvBlock(nn.Module):
@@ -162,7 +212,7 @@ class ConvBlock(nn.Module):
         centre = self.param("centre", nn.initializers.zeros, (self.filters,))
         dtype = jnp.bfloat16 if self.mixed_precision else kernel.dtype
         x = conv2d(x.astype(dtype), kernel.astype(dtype), self.stride)
-        return nn.relu(centred_layer_norm(x.astype(bias.dtype) + bias, centre)).astype(dtype)
+        return shifted_relu(layer_norm(add_bias(x, bias)), centre, dtype)
 
 
 class Dense(nn.Module):
@@ -188,6 +238,6 @@ class Dense(nn.Module):
         x = x + self.param("bias", nn.initializers.zeros, (self.features,))
         if self.hidden:
             if self.norm:
-                x = centred_layer_norm(x, self.param("centre", nn.initializers.zeros, (self.features,)))
+                x = layer_norm(x) + self.param("centre", nn.initializers.zeros, (self.features,))
             x = nn.relu(x)
         return x

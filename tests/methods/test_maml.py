@@ -9,7 +9,7 @@ import numpy as np
 import optax
 import pytest
 
-from milx import methods
+from milx import methods, trainer
 from milx.config import Config, MILConfig, NetworkConfig
 from milx.methods import maml
 from milx.methods.maml import MIL
@@ -303,6 +303,17 @@ def test_adapt_under_vmap_equals_a_loop(batch):
     for i in range(TASKS):
         alone = adapt(params, jax.tree.map(lambda x, i=i: x[i], batch.support))["policy"]
         assert_trees_close(jax.tree.map(lambda x, i=i: x[i], together), alone)
+
+
+@pytest.mark.parametrize("tasks_at_once", [1, 2])
+def test_meta_gradient_of_a_few_tasks_at_a_time(batch, monkeypatch, tasks_at_once):
+    method, params = build()
+    images_per_task = STEPS * (1 + 2)
+    monkeypatch.setattr(trainer, "_CPU_IMAGES", tasks_at_once * images_per_task)
+    found, metrics = jax.jit(functools.partial(trainer.meta_gradient, method))(params, batch)
+    (loss, _), gradient = jax.jit(jax.value_and_grad(method.loss, has_aux=True))(params, batch)
+    assert metrics["loss"] == pytest.approx(float(loss), rel=1e-12)
+    assert_trees_close(found, gradient)
 
 
 def test_several_demonstrations_give_the_average_of_their_steps():

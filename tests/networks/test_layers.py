@@ -120,11 +120,10 @@ def test_soft_argmax_divides_by_the_temperature_of_each_channel(rng):
 
 
 @pytest.mark.parametrize("shape", [(3, 4, 5, 6), (3, 20)])
-def test_layer_norm_has_zero_mean_and_unit_variance_before_its_centre(rng, shape):
+def test_layer_norm_has_zero_mean_and_unit_variance(rng, shape):
     scale = np.array([0.5, 10.0, 300.0]).reshape(-1, *[1] * (len(shape) - 1))
-    x, bias = scale * (rng.standard_normal(shape) + 3), rng.standard_normal(shape[-1])
-    axes = tuple(range(1, len(shape)))
-    found = np.asarray(layers.centred_layer_norm(jnp.asarray(x), jnp.asarray(bias))) - bias
+    x, axes = scale * (rng.standard_normal(shape) + 3), tuple(range(1, len(shape)))
+    found = np.asarray(layers.layer_norm(jnp.asarray(x)))
     np.testing.assert_allclose(found.mean(axes), 0, atol=1e-12)
     # 1e-6 is added to the variance.
     variance = x.var(axes)
@@ -135,10 +134,38 @@ def test_layer_norm_has_zero_mean_and_unit_variance_before_its_centre(rng, shape
     )
 
 
-def test_layer_norm_of_a_constant_image_is_its_centre_and_has_finite_gradients():
-    bias = jnp.array([1.0, -2.0])
-    found, gradient = jax.value_and_grad(lambda x: jnp.sum(layers.centred_layer_norm(x, bias) ** 3))(
-        jnp.full((2, 3, 4, 2), 7.0)
-    )
-    assert found == pytest.approx(2 * 3 * 4 * (1 - 8))
+def test_layer_norm_of_a_constant_image_is_zero_and_has_finite_gradients():
+    found, gradient = jax.value_and_grad(lambda x: jnp.sum((1 + layers.layer_norm(x)) ** 3))(jnp.full((2, 3, 4), 7.0))
+    assert found == pytest.approx(2 * 3 * 4)
     assert np.isfinite(gradient).all()
+
+
+# Bias and centre: derivatives of their own, which must be those that JAX finds.
+
+
+@pytest.mark.parametrize("by_product", [False, True])
+@pytest.mark.parametrize(
+    ("written", "plain"),
+    [
+        (layers.add_bias, lambda x, shift: x + shift),
+        (lambda x, shift: layers.shifted_relu(x, shift, x.dtype), lambda x, shift: jax.nn.relu(x + shift)),
+    ],
+)
+def test_derivatives_of_bias_and_centre(rng, monkeypatch, by_product, written, plain):
+    if by_product:
+        monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    inputs = jnp.asarray(rng.standard_normal((2, 3, 4, 5))), jnp.asarray(rng.standard_normal(5))
+    tangent = jax.tree.map(lambda x: jnp.asarray(rng.standard_normal(x.shape)), inputs)
+
+    def derivatives(function):
+        gradient = jax.grad(lambda inputs: jnp.sum(jnp.sin(function(*inputs)) ** 2))
+        return jax.jvp(gradient, (inputs,), (tangent,))
+
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-12), derivatives(written), derivatives(plain))
+
+
+def test_bfloat16_images_have_a_float32_bias_gradient():
+    # 4,096 times 1/3: a sum in bfloat16 would stop growing at 256 times as much as one of its terms.
+    x, weight = jnp.zeros((4096, 3), jnp.bfloat16), 1 / 3
+    found = jax.grad(lambda bias: weight * layers.add_bias(x, bias).sum())(jnp.zeros(3))
+    np.testing.assert_allclose(found, 4096 * float(jnp.bfloat16(weight)), rtol=1e-6)
