@@ -2,7 +2,8 @@
 
     python experiments/benchmarks/growth.py
 
-The paper's reach network, rendering included; one size changes at a time.
+The paper's reach network, rendering included; one size changes at a time from 5 tasks, 50 time steps, 64 rows of 80
+pixels and 1 inner step.
 """
 
 import pathlib
@@ -15,31 +16,31 @@ from milx import envs
 from milx.config import make_config
 
 _OUT = flags.DEFINE_string("out", str(common.RESULTS), "Folder of the JSON file.")
-_TINY = flags.DEFINE_bool("tiny", False, "Two sizes of each, for a try.")
+_TINY = flags.DEFINE_bool("tiny", False, "One size of each, for a try.")
 _SIZES = {
-    "meta-batch": (5, 15, 40, 100),
-    "time steps": (10, 25, 50),
-    "image rows": (32, 64, 128),
-    "inner steps": (1, 3, 5),
+    "meta-batch": (15, 40, 100),
+    "time steps": (10, 25),
+    "image rows": (32, 128),
+    "inner steps": (3, 5),
 }
 
 
 def main(_: list[str]) -> None:
     """Measures and writes the JSON file."""
     report = common.Report("growth", pathlib.Path(_OUT.value))
-    for name, sizes in _SIZES.items():
-        for size in sizes[: 2 if _TINY.value else None]:
-            config = make_config("reach", preset="paper")
-            config.network.mixed_precision = common.ACCELERATED
-            frames = size if name == "time steps" else config.train.support_frames
-            config.train.support_frames = config.train.query_frames = frames
-            config.train.meta_batch = size if name == "meta-batch" else config.train.meta_batch
-            config.mil.inner_steps = size if name == "inner steps" else config.mil.inner_steps
-            rows = size if name == "image rows" else config.env.image_shape[0]
-            config.env.image_shape = (rows, rows * 5 // 4)
-            report.measure(
-                f"{name} {size}", "ms", lambda c=config: workload.measure_step(c, envs.make("reach", c.env.image_shape))
-            )
+    changes = [(name, size) for name, sizes in _SIZES.items() for size in sizes[: 1 if _TINY.value else None]]
+    for name, size in [("meta-batch", 5), *changes]:
+        config = make_config("reach", preset="paper")
+        config.network.mixed_precision = common.ACCELERATED
+        frames = size if name == "time steps" else config.train.support_frames
+        config.train.support_frames = config.train.query_frames = frames
+        config.train.meta_batch = size if name == "meta-batch" else config.train.meta_batch
+        config.mil.inner_steps = size if name == "inner steps" else config.mil.inner_steps
+        rows = size if name == "image rows" else config.env.image_shape[0]
+        config.env.image_shape = (rows, rows * 5 // 4)
+        report.measure(
+            f"{name} {size}", "ms", lambda c=config: workload.measure_step(c, envs.make("reach", c.env.image_shape))
+        )
 
 
 if __name__ == "__main__":
