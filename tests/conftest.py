@@ -38,6 +38,11 @@ class Trained:
         return [json.loads(line) for line in (self.folder / "metrics.jsonl").read_text().splitlines()]
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The files that take longest first, so that in the end no process is left alone with one of them."""
+    items.sort(key=lambda item: item.path.name not in ("test_parallel.py", "test_notebook.py"))
+
+
 @pytest.fixture(scope="session", autouse=True)
 def cache(tmp_path_factory):
     """Demonstrations are cached for this session only; compiled programs stay where milx puts them.

@@ -164,6 +164,11 @@ class Env(abc.ABC):
     def task_blind(self, key: jax.Array, task: Task) -> Task:
         """The task as someone understands it who saw no demonstration: a random candidate is the target."""
 
+    def model_of(self, task: Task) -> mjx.Model:
+        """The model with the task's shapes, masses and friction; the same for all tasks unless overridden."""
+        del task
+        return self.model
+
     def data(self, state: State) -> mjx.Data:
         """MJX data holding this state; derived quantities are not computed yet."""
         return self._data.replace(qpos=state.qpos, qvel=state.qvel, mocap_pos=state.mocap_pos)
@@ -175,13 +180,13 @@ class Env(abc.ABC):
 
         # Only positions and velocities are carried: MJX's data is large, and the rest follows from them.
         x, _ = jax.lax.scan(
-            lambda x, _: (self.integrate(state.with_vector(x), ctrl), None), state.vector, length=self.substeps
+            lambda x, _: (self.integrate(task, state.with_vector(x), ctrl), None), state.vector, length=self.substeps
         )
         return state.with_vector(x)
 
-    def integrate(self, state: State, ctrl: jax.Array) -> jax.Array:
+    def integrate(self, task: Task, state: State, ctrl: jax.Array) -> jax.Array:
         """One physics step of the model's time step: the next `state.vector`."""
-        data = mjx.step(self.model, self.data(state).replace(ctrl=ctrl))
+        data = mjx.step(self.model_of(task), self.data(state).replace(ctrl=ctrl))
         return jnp.concatenate([data.qpos, data.qvel])
 
     @functools.partial(jax.jit, static_argnums=0)
@@ -193,9 +198,10 @@ class Env(abc.ABC):
     @functools.partial(jax.jit, static_argnums=0)
     def render(self, task: Task, state: State) -> jax.Array:
         """The camera's image [H, W, 3] uint8 of the task's scene."""
-        data = mjx.kinematics(self.model, self.data(state))
-        data = mjx.camlight(self.model, mjx.com_pos(self.model, data))
-        scene = dataclasses.replace(self.renderer.scene(data), geom_rgba=self.colors(task))
+        model = self.model_of(task)
+        data = mjx.kinematics(model, self.data(state))
+        data = mjx.camlight(model, mjx.com_pos(model, data))
+        scene = dataclasses.replace(self.renderer.scene(data), geom_size=model.geom_size, geom_rgba=self.colors(task))
         return self.renderer.pixels(scene)
 
 

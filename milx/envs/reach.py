@@ -99,7 +99,7 @@ class Reach(Env):
         data = mjx.kinematics(self.model, self._data.replace(qpos=qpos))
         return data.site_xpos[self._fingertip, :2]
 
-    def integrate(self, state: State, ctrl: jax.Array) -> jax.Array:
+    def integrate(self, task: ReachTask, state: State, ctrl: jax.Array) -> jax.Array:
         """One Runge-Kutta step: `mjx.step`'s, but with one copy of the dynamics in the program instead of two."""
         h, x0 = self.mj_model.opt.timestep, state.vector
 

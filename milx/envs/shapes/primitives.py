@@ -84,8 +84,8 @@ def shape(*primitives: Stick | Egg | Box | Drum) -> Shape:
     Raises:
         ValueError: for too many of a kind, or no stick.
     """
-    kinds = {kind: tuple(p for p in primitives if isinstance(p, kind)) for kind in (Stick, Egg, Box, Drum)}
-    limits = {Stick: NUM_STICKS, Egg: NUM_EGGS, Box: NUM_BOXES, Drum: NUM_DRUMS}
+    limits: dict[type, int] = {Stick: NUM_STICKS, Egg: NUM_EGGS, Box: NUM_BOXES, Drum: NUM_DRUMS}
+    kinds = {kind: tuple(p for p in primitives if isinstance(p, kind)) for kind in limits}
     for kind, limit in limits.items():
         if len(kinds[kind]) > limit:
             raise ValueError(f"shape: got {len(kinds[kind])} of {kind.__name__}, expected at most {limit}")
@@ -99,12 +99,12 @@ def ball(x: float, y: float, radius: float) -> Stick:
     return Stick(x, y, x, y, radius)
 
 
-def strokes(text: str, radius: float = 0.17) -> Shape:
+def strokes(text: str, radius: float = 0.22) -> Shape:
     """Sticks between points "x,y", as in "-1,-1 0,1 1,-1" for a roof; "|" lifts the pen."""
     sticks = []
     for line in text.split("|"):
-        points = [tuple(float(v) for v in point.split(",")) for point in line.split()]
-        sticks += [Stick(*a, *b, radius) for a, b in itertools.pairwise(points)]
+        points = [[float(v) for v in point.split(",")] for point in line.split()]
+        sticks += [Stick(x0, y0, x1, y1, radius) for (x0, y0), (x1, y1) in itertools.pairwise(points)]
     return shape(*sticks)
 
 
