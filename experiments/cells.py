@@ -35,6 +35,11 @@ STEPS = {"reach": 16_000, "reach_state": 4_000}
 """Meta-updates of every method."""
 
 
+def methods_of(env: str, chosen: list[str] | None) -> list[str]:
+    """The methods of an environment, or those of them that were chosen."""
+    return [method for method in METHODS[env] if chosen is None or method in chosen]
+
+
 def configure(env: str, method: str, preset: str, seed: int, steps: int) -> Config:
     """A preset as methods are compared: in `steps` meta-updates, from scenes that are not redrawn.
 

@@ -36,7 +36,7 @@ def run_cells() -> None:
     runner = cells.Cells(pathlib.Path(_OUT.value), sizes[-1])
     for env in _ENVS.value:
         for seed in range(max(_SEEDS.value, _END_SEEDS.value)):
-            for method in _METHODS.value or cells.METHODS[env]:
+            for method in cells.methods_of(env, _METHODS.value):
                 for tasks in reversed(sizes):
                     at_end = tasks in (sizes[0], sizes[-1])
                     if seed < (_END_SEEDS.value if at_end else _SEEDS.value):

@@ -45,7 +45,7 @@ def main(_: list[str]) -> None:
     print("| environment | method | " + " | ".join(CANDIDATES) + " |", "|---|---|---|---|---|---|", sep="\n")
     for env in _ENVS.value:
         runner = cells.Cells(folder, make_config(env, preset=_PRESET.value).data.tasks)
-        for method in _METHODS.value or cells.METHODS[env]:
+        for method in cells.methods_of(env, _METHODS.value):
             names = {candidate: f"{env}-{method}-{candidate.replace(', ', '-')}" for candidate in CANDIDATES}
             for candidate, name in names.items():
                 config = configure(env, method, candidate)

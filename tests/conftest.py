@@ -1,4 +1,4 @@
-"""One tiny run, planned, trained and evaluated once a session; tests of its parts look at what it left."""
+"""One tiny run, planned, trained and evaluated once in each test process; tests of its parts look at what it left."""
 
 import dataclasses
 import json

@@ -164,6 +164,10 @@ class Env(abc.ABC):
     def task_blind(self, key: jax.Array, task: Task) -> Task:
         """The task as someone understands it who saw no demonstration: a random candidate is the target."""
 
+    def guess(self, task: Task, state: State) -> jax.Array:
+        """[T, A] actions with which the planner begins; nothing unless overridden."""
+        return jnp.zeros((self.horizon, self.action_size))
+
     def model_of(self, task: Task) -> mjx.Model:
         """The model with the task's shapes, masses and friction; the same for all tasks unless overridden."""
         del task
@@ -176,17 +180,17 @@ class Env(abc.ABC):
     @functools.partial(jax.jit, static_argnums=0)  # so that MJX, slow to trace, is traced once for all callers
     def step(self, task: Task, state: State, action: jax.Array) -> State:
         """Applies `action` [A], clipped to `action_range`, for `substeps` physics steps."""
-        ctrl = jnp.clip(action, *self.action_range)
+        ctrl, model = jnp.clip(action, *self.action_range), self.model_of(task)
 
         # Only positions and velocities are carried: MJX's data is large, and the rest follows from them.
         x, _ = jax.lax.scan(
-            lambda x, _: (self.integrate(task, state.with_vector(x), ctrl), None), state.vector, length=self.substeps
+            lambda x, _: (self.integrate(model, state.with_vector(x), ctrl), None), state.vector, length=self.substeps
         )
         return state.with_vector(x)
 
-    def integrate(self, task: Task, state: State, ctrl: jax.Array) -> jax.Array:
+    def integrate(self, model: mjx.Model, state: State, ctrl: jax.Array) -> jax.Array:
         """One physics step of the model's time step: the next `state.vector`."""
-        data = mjx.step(self.model_of(task), self.data(state).replace(ctrl=ctrl))
+        data = mjx.step(model, self.data(state).replace(ctrl=ctrl))
         return jnp.concatenate([data.qpos, data.qvel])
 
     @functools.partial(jax.jit, static_argnums=0)

@@ -1,4 +1,4 @@
-"""Push: a seven-joint arm pushes one of two things onto a red disc, by torques (paper, Section 6.2)."""
+"""Push: a seven-joint arm pushes one of two objects onto a red disc, by torques (paper, Section 6.2)."""
 
 import dataclasses
 import functools
@@ -9,29 +9,32 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
+from milx.envs import push_controller
 from milx.envs.base import ASSETS, Env, State, check_split
 from milx.envs.shapes import SHAPES, SPLITS
-from milx.envs.shapes import primitives as shapes
+from milx.envs.shapes.primitives import NUM_CAPSULES, SLOTS, to_geoms, to_outline
 
 GOAL_RADIUS = 0.08
 """The red disc's (m); its centre is at x = y = 0."""
 STEPS_ON_GOAL = 10
-"""So many of the episode's steps the thing must be on the disc."""
+"""So many of the episode's steps the object must be on the disc."""
 LOW, HIGH = (-0.3, -0.2), (0.0, 0.2)
-"""Where things start: least and greatest x and y (m)."""
+"""Where objects start: least and greatest x and y (m)."""
 FROM_GOAL = 0.17
-"""Least distance of a thing's start from the goal (m)."""
+"""Least distance of an object's start from the goal (m)."""
 SPACING = 0.15
-"""Least distance between the things' starts (m), which lie on opposite sides of the middle."""
+"""Least distance between the objects' centres at the start (m; paper: 0.1). They lie on opposite sides."""
 SIZE = (0.038, 0.052)
 """Unit of length of the shapes (m), drawn uniformly."""
 MASS = (0.2, 1.0)
-"""Of a thing (kg), drawn uniformly."""
+"""Of an object (kg), drawn uniformly."""
 DAMPING = (0.2, 5.0)
-"""Of a thing's sliding (N s/m), drawn uniformly."""
+"""Of an object's sliding (N s/m), drawn uniformly."""
 NUM_JOINTS = 7
-_START = (0.0, -0.927, 0.0, 2.402, 0.0, 0.096, 0.0)
-_THINGS = ("thing_0", "thing_1")
+_START = (0.0, -0.895, 0.0, 2.397, 0.0, 0.069, 0.0)
+_OUT_OF_THE_WAY = (0.0, 0.0, -10.0)
+OBJECT_COST, TIP_COST, ACTION_COST, FINAL_COST = 1.0, 0.5, 0.1, 10.0
+_OBJECTS = ("object_0", "object_1")
 _PRONGS = ("prong_left", "prong_middle", "prong_right")
 _CANDIDATES = 64
 
@@ -39,11 +42,11 @@ _CANDIDATES = 64
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class PushTask:
-    """Two things, and which of them is to be pushed.
+    """Two objects, and which of them is to be pushed.
 
     Attributes:
         target: int32, 0 or 1.
-        shape: [2] int32, index into SHAPES of each thing.
+        shape: [2] int32, index into SHAPES of each object.
         size: [2] unit of length of its shape (m).
         mass: [2] kg.
         damping: [2] N s/m of viscous friction when it slides; friction against turning follows from its outline.
@@ -59,7 +62,7 @@ class PushTask:
 
 
 class Push(Env):
-    """Seven torque-controlled joints, two things that slide and turn, 125x125 pixels, 100 actions of 0.05 s.
+    """Seven torque-controlled joints, two objects that slide and turn, 125x125 pixels, 100 actions of 0.05 s.
 
     The robot's state is 20-dimensional: seven joint angles (rad), seven joint velocities (rad/s), the position of the
     hand's tip (m) and the unit vector in which the hand pushes. An action is seven motor commands in [-1, 1], of 2 N m
@@ -80,16 +83,22 @@ class Push(Env):
         model = self.mj_model
         self._rgba = jnp.asarray(model.geom_rgba, float)
         self._tip, self._hand = model.site("tip").id, model.body("hand").id
-        self._body = np.array([model.body(name).id for name in _THINGS])
+        self._body = np.array([model.body(name).id for name in _OBJECTS])
         self._dof = np.array([model.jnt_dofadr[model.body_jntadr[body]] + np.arange(3) for body in self._body])
         self._geom = np.array([model.body_geomadr[body] + np.arange(model.body_geomnum[body]) for body in self._body])
-        catalogue = [shapes.geoms(shape) for shape in SHAPES.values()]
-        self._pos, self._quat, self._size, self._seen, self._gyration = (
-            jnp.asarray(np.array(column)) for column in zip(*catalogue, strict=True)
+        columns = zip(*(to_geoms(shape) for shape in SHAPES.values()), strict=True)
+        self._pos, self._quat, self._size, self._used, self._seen, self._squared_gyration = (
+            jnp.asarray(np.array(column)) for column in columns
         )
+        outlines = [to_outline(shape) for shape in SHAPES.values()]
+        self._ends, self._radius = (jnp.asarray(np.array(column)) for column in zip(*outlines, strict=True))
 
     def sample_task(self, key: jax.Array, split: str) -> PushTask:
-        """Draws two different shapes of the split, their sizes, masses, friction and colours, and the target."""
+        """Draws two different shapes of the split, their sizes, masses, friction and colours, and the target.
+
+        Raises:
+            ValueError: for a split that does not exist.
+        """
         check_split(split)
         names = list(SHAPES)
         indices = jnp.array([names.index(name) for name in SPLITS[split]])
@@ -105,15 +114,18 @@ class Push(Env):
         )
 
     def redraw_appearance(self, key: jax.Array, task: PushTask) -> PushTask:
-        """The same things in other colours."""
+        """The same objects in other colours."""
         return dataclasses.replace(task, color=jax.random.uniform(key, (2, 3)))
 
     def redraw_scene(self, key: jax.Array, task: PushTask, states: State) -> State:
-        """The same states: both things may have been touched."""
+        """The same states: both objects may have been touched."""
         return states
 
     def reset(self, key: jax.Array, task: PushTask) -> State:
-        """Stands the hand before the table's middle, and the things on either side of it, turned at random."""
+        """Stands the hand before the table's middle, and the objects on either side of it, turned at random.
+
+        Both are drawn from the same distribution, so that the place does not tell the target.
+        """
         place_key, side_key, turn_key = jax.random.split(key, 3)
         low, high = jnp.array(LOW), jnp.array(HIGH)
         place = jax.random.uniform(place_key, (_CANDIDATES, 2, 2), minval=low, maxval=high)
@@ -121,38 +133,43 @@ class Push(Env):
         place = place.at[..., 1].set(side * jnp.abs(place[..., 1]))
         from_goal = jnp.linalg.norm(place, axis=-1).min(axis=-1) > FROM_GOAL
         apart = jnp.linalg.norm(place[:, 0] - place[:, 1], axis=-1) > SPACING
-        first = place[jnp.argmax(from_goal & apart)]  # one of two draws keeps the distances, so one of 64 always does
+        # A third of the draws keep the distances, so one of 64 always does.
+        first = place[jnp.argmax(from_goal & apart)]
         turn = jax.random.uniform(turn_key, (2, 1), minval=-jnp.pi, maxval=jnp.pi)
-        things = jnp.concatenate([first, turn], axis=-1).ravel()
-        qpos = jnp.concatenate([jnp.array(_START), things])
+        objects = jnp.concatenate([first, turn], axis=-1).ravel()
+        qpos = jnp.concatenate([jnp.array(_START), objects])
         return State(qpos, jnp.zeros_like(qpos), jnp.zeros((0, 3)))
 
     @functools.partial(jax.jit, static_argnums=0)
     def model_of(self, task: PushTask) -> mjx.Model:
-        """The model with the task's things: their geoms, masses, inertias and friction."""
+        """The model with the task's objects: their geoms, masses, inertias and friction."""
         model, unit = self.model, task.size[:, None, None]
-        things, geoms, dofs = self._body, self._geom, self._dof
-        inertia = task.mass * self._gyration[task.shape] * task.size**2
-        per_mass = jnp.stack([2 / task.mass, 1 / inertia], axis=-1) / 3
-        friction = jnp.stack([jnp.ones(2), jnp.ones(2), self._gyration[task.shape] * task.size**2], axis=-1)
+        objects, geoms, dofs = self._body, self._geom, self._dof
+        # A plate on a viscous table: what holds for a point holds for turning, times the mean squared lever.
+        lever = self._squared_gyration[task.shape] * task.size**2
+        inertia = task.mass * lever
+        inverse = jnp.stack([2 / task.mass, 1 / inertia], axis=-1) / 3  # of two slides and one hinge, over three axes
+        pos = jnp.where(self._used[task.shape][..., None], unit * self._pos[task.shape], jnp.array(_OUT_OF_THE_WAY))
         return model.replace(
-            geom_pos=model.geom_pos.at[geoms].set(unit * self._pos[task.shape]),
+            geom_pos=model.geom_pos.at[geoms].set(pos),
             geom_quat=model.geom_quat.at[geoms].set(self._quat[task.shape]),
             geom_size=model.geom_size.at[geoms].set(unit * self._size[task.shape]),
-            body_mass=model.body_mass.at[things].set(task.mass),
-            body_subtreemass=model.body_subtreemass.at[things].set(task.mass),
-            body_inertia=model.body_inertia.at[things].set(inertia[:, None]),
-            body_invweight0=model.body_invweight0.at[things].set(per_mass),
-            dof_damping=model.dof_damping.at[dofs].set(task.damping[:, None] * friction),
+            body_mass=model.body_mass.at[objects].set(task.mass),
+            body_subtreemass=model.body_subtreemass.at[objects].set(task.mass),
+            body_inertia=model.body_inertia.at[objects].set(inertia[:, None]),
+            body_invweight0=model.body_invweight0.at[objects].set(inverse),
+            dof_damping=model.dof_damping.at[dofs].set(
+                task.damping[:, None] * jnp.stack([jnp.ones(2), jnp.ones(2), lever], axis=-1)
+            ),
         )
 
-    def things(self, state: State) -> jax.Array:
-        """[2, 3] x, y (m) and turn (rad) of both things."""
+    def objects(self, state: State) -> jax.Array:
+        """[2, 3] x, y (m) and turn (rad) of both objects."""
         return state.qpos[NUM_JOINTS:].reshape(2, 3)
 
     @functools.partial(jax.jit, static_argnums=0)
     def hand(self, qpos: jax.Array) -> jax.Array:
-        """[9] position of the hand's tip (m), the way the hand pushes and the way its prongs point, for all joints."""
+        """[9] tip position (m), unit vectors of the hand's pushing and of its prongs, for all joint positions [13]."""
         data = mjx.kinematics(self.model, self._data.replace(qpos=qpos))
         pose = data.xmat[self._hand].reshape(3, 3)
         return jnp.concatenate([data.site_xpos[self._tip], pose[:, 2], pose[:, 0]])
@@ -167,19 +184,43 @@ class Push(Env):
         color = jnp.broadcast_to(task.color[:, None], (*seen.shape, 3))
         return self._rgba.at[self._geom].set(jnp.concatenate([color, seen[..., None]], axis=-1))
 
+    def guess(self, task: PushTask, state: State) -> jax.Array:
+        """[T, 7] what `push_controller` does from here."""
+
+        def step(state: State, _: None) -> tuple[State, jax.Array]:
+            action = self.control(task, state)
+            return self.step(task, state, action), action
+
+        return jax.lax.scan(step, state, length=self.horizon)[1]
+
+    def control(self, task: PushTask, state: State) -> jax.Array:
+        """[7] the action of `push_controller` for one state."""
+        target = task.target
+        x, y, turn = self.objects(state)[target]
+        pose, jacobian = self.hand(state.qpos), jax.jacfwd(self.hand)(state.qpos)[:, :NUM_JOINTS]
+        place = jnp.stack([x, y])
+        backwards = place / jnp.maximum(jnp.linalg.norm(place), 0.02)
+        cos, sin = jnp.cos(turn), jnp.sin(turn)
+        direction = jnp.array([[cos, sin], [-sin, cos]]) @ backwards
+        ends, radius = self._ends[task.shape[target]], self._radius[task.shape[target]]
+        back = task.size[target] * (jnp.max(ends @ direction, axis=-1) + radius).max()
+        return push_controller.act(pose, jacobian, state.qvel[:NUM_JOINTS], place, back, task.damping[target])
+
     def running_residual(self, task: PushTask, state: State, action: jax.Array, t: jax.Array) -> jax.Array:
-        """[12] the released code's reward as residuals: thing off goal, tip off thing (m), and action, weighted."""
-        thing, tip = self.things(state)[task.target, :2], self.hand(state.qpos)[:3]
-        off = tip - jnp.append(thing, 0.02)
-        return jnp.concatenate([thing, 0.5 * off, 0.1 * action])
+        """[11] object off goal, tip off object (m), and action, weighted.
+
+        The terms of the released code's reward, but their squares instead of their norms.
+        """
+        place, tip = self.objects(state)[task.target, :2], self.hand(state.qpos)[:2]
+        return jnp.concatenate([OBJECT_COST * place, TIP_COST * (tip - place), ACTION_COST * action])
 
     def terminal_residual(self, task: PushTask, state: State) -> jax.Array:
-        """[2] thing off goal (m), weighted."""
-        return 10.0 * self.things(state)[task.target, :2]
+        """[2] object off goal (m), weighted."""
+        return FINAL_COST * self.objects(state)[task.target, :2]
 
     def steps_near_goal(self, task: PushTask, states: State, radius: float) -> jax.Array:
         """In how many of the steps the target's centre is closer to the goal's than `radius` (m)."""
-        place = jax.vmap(self.things)(jax.tree.map(lambda x: x[1:], states))[:, task.target, :2]
+        place = jax.vmap(self.objects)(jax.tree.map(lambda x: x[1:], states))[:, task.target, :2]
         return (jnp.linalg.norm(place, axis=-1) < radius).sum()
 
     def success(self, task: PushTask, states: State) -> jax.Array:
@@ -187,31 +228,23 @@ class Push(Env):
         return self.steps_near_goal(task, states, GOAL_RADIUS) >= STEPS_ON_GOAL
 
     def task_blind(self, key: jax.Array, task: PushTask) -> PushTask:
-        """The task with a random thing as the target."""
+        """The task with a random object as the target."""
         return dataclasses.replace(task, target=jax.random.randint(key, (), 0, 2))
 
 
 def _build() -> mujoco.MjModel:
-    """The arm and the table, with two things whose geoms every task sets anew."""
+    """The arm and the table, with two objects whose geoms every task sets anew."""
     spec = mujoco.MjSpec.from_file(str(ASSETS / "push.xml"))
-    types = mujoco.mjtGeom
-    slots = (
-        (types.mjGEOM_CAPSULE, shapes.NUM_STICKS),
-        (types.mjGEOM_ELLIPSOID, shapes.NUM_EGGS),
-        (types.mjGEOM_BOX, shapes.NUM_BOXES),
-        (types.mjGEOM_CYLINDER, shapes.NUM_DRUMS),
-    )
-    for thing, y in zip(_THINGS, (0.15, -0.15), strict=True):
-        body = spec.worldbody.add_body(
-            name=thing, pos=[0, 0, 0], mass=1.0, inertia=[1, 1, 1], explicitinertial=True, ipos=[0, 0, 0]
-        )
-        hinge, slide = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
-        for name, kind, axis in (("x", slide, [1, 0, 0]), ("y", slide, [0, 1, 0]), ("turn", hinge, [0, 0, 1])):
-            body.add_joint(name=f"{thing}_{name}", type=kind, axis=axis, damping=1.0, armature=0.0)
-        for kind, count in slots:
+    hinge, slide = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
+    for name in _OBJECTS:
+        body = spec.worldbody.add_body(name=name, mass=1.0, inertia=[1, 1, 1], explicitinertial=True)
+        for joint, kind, axis in (("x", slide, [1, 0, 0]), ("y", slide, [0, 1, 0]), ("turn", hinge, [0, 0, 1])):
+            body.add_joint(name=f"{name}_{joint}", type=kind, axis=axis, damping=1.0, armature=0.0)
+        for kind, count in SLOTS.items():
             for i in range(count):
-                body.add_geom(name=f"{thing}_{kind.name[7:].lower()}_{i}", type=kind, size=[0.02] * 3, pos=[0, y, 0.02])
+                geom_type = getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}")
+                body.add_geom(name=f"{name}_{kind}_{i}", type=geom_type, size=[0.02] * 3)
         for prong in _PRONGS:
-            for i in range(shapes.NUM_STICKS):
-                spec.add_pair(geomname1=prong, geomname2=f"{thing}_capsule_{i}", condim=1)
+            for i in range(NUM_CAPSULES):
+                spec.add_pair(geomname1=prong, geomname2=f"{name}_capsule_{i}", condim=1)
     return spec.compile()

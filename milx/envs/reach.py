@@ -99,14 +99,14 @@ class Reach(Env):
         data = mjx.kinematics(self.model, self._data.replace(qpos=qpos))
         return data.site_xpos[self._fingertip, :2]
 
-    def integrate(self, task: ReachTask, state: State, ctrl: jax.Array) -> jax.Array:
+    def integrate(self, model: mjx.Model, state: State, ctrl: jax.Array) -> jax.Array:
         """One Runge-Kutta step: `mjx.step`'s, but with one copy of the dynamics in the program instead of two."""
         h, x0 = self.mj_model.opt.timestep, state.vector
 
         def stage(carry: tuple, coefficients: jax.Array) -> tuple[tuple, None]:
             x, slope = carry
             ahead, weight = coefficients
-            data = mjx.forward(self.model, self.data(state.with_vector(x0 + h * ahead * slope)).replace(ctrl=ctrl))
+            data = mjx.forward(model, self.data(state.with_vector(x0 + h * ahead * slope)).replace(ctrl=ctrl))
             slope = jnp.concatenate([data.qvel, data.qacc])
             return (x + h * weight * slope, slope), None
 

@@ -15,7 +15,7 @@ from milx.trajopt.ilqr import Options, Plan, Problem, solve
 
 
 def plan(env: Env, task: Task, state: State, options: Options) -> Plan:
-    """Plans one episode from `state`: iLQR on the environment's costs, started from zero actions."""
+    """Plans one episode from `state`: iLQR on the environment's costs, started from the environment's guess."""
     low, high = env.action_range
     problem = Problem(
         dynamics=lambda x, u: env.step(task, state.with_vector(x), u).vector,
@@ -24,7 +24,7 @@ def plan(env: Env, task: Task, state: State, options: Options) -> Plan:
         control_low=low,
         control_high=high,
     )
-    return solve(problem, state.vector, jnp.zeros((env.horizon, env.action_size)), options)
+    return solve(problem, state.vector, env.guess(task, state), options)
 
 
 def demonstrate(

@@ -164,8 +164,14 @@ def test_derivatives_of_bias_and_centre(rng, monkeypatch, by_product, written, p
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-12), derivatives(written), derivatives(plain))
 
 
-def test_bfloat16_images_have_a_float32_bias_gradient():
+@pytest.mark.parametrize("by_product", [False, True])
+def test_gradients_of_bfloat16_images_are_summed_in_float32(monkeypatch, by_product):
     # 4,096 times 1/3: a sum in bfloat16 would stop growing at 256 times as much as one of its terms.
-    x, weight = jnp.zeros((4096, 3), jnp.bfloat16), 1 / 3
-    found = jax.grad(lambda bias: weight * layers.add_bias(x, bias).sum())(jnp.zeros(3))
-    np.testing.assert_allclose(found, 4096 * float(jnp.bfloat16(weight)), rtol=1e-6)
+    if by_product:
+        monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    x, weight = jnp.ones((4096, 3)), 1 / 3
+    expected = np.full(3, 4096 * float(jnp.bfloat16(weight)))
+    bias = jax.grad(lambda bias: weight * layers.add_bias(x.astype(jnp.bfloat16), bias).sum())(jnp.zeros(3))
+    np.testing.assert_allclose(bias, expected, rtol=1e-6)
+    centre = jax.grad(lambda centre: (weight * layers.shifted_relu(x, centre, jnp.bfloat16).astype(float)).sum())
+    np.testing.assert_allclose(centre(jnp.zeros(3)), expected, rtol=1e-6)

@@ -1,6 +1,6 @@
 """Letters, signs and turned pieces."""
 
-from milx.envs.shapes.primitives import Box, Drum, Egg, Stick, ball, shape, strokes, turned
+from milx.envs.shapes.primitives import Box, Capsule, Cylinder, Ellipsoid, ball, shape, strokes, turned
 
 LETTERS = {
     "letter_a": strokes("-0.8,-1 0,1 0.8,-1|-0.45,-0.2 0.45,-0.2"),
@@ -39,41 +39,57 @@ SIGNS = {
     "trident": strokes("0,-1 0,1|-0.7,1 -0.6,0.1 0.6,0.1", 0.15),
     "hook": strokes("0,1 0,-0.5 0.5,-0.9 0.9,-0.4", 0.2),
     "anchor": shape(
-        Stick(0, -0.8, 0, 0.8, 0.15),
-        Stick(-0.8, -0.3, 0, -0.9, 0.15),
-        Stick(0.8, -0.3, 0, -0.9, 0.15),
+        Capsule(0, -0.8, 0, 0.8, 0.15),
+        Capsule(-0.8, -0.3, 0, -0.9, 0.15),
+        Capsule(0.8, -0.3, 0, -0.9, 0.15),
         ball(0, 0.9, 0.25),
     ),
 }
 
 TURNED = {
-    "pawn": turned(("drum", 0.55, 0.2), ("drum", 0.4, 0.7), ("drum", 0.22, 0.6), ("egg", 0.4, 0.7)),
-    "rook": turned(("drum", 0.6, 0.2), ("drum", 0.4, 1.4), ("drum", 0.55, 0.5)),
-    "bishop": turned(("drum", 0.55, 0.2), ("drum", 0.35, 0.7), ("egg", 0.42, 1.1), ("egg", 0.12, 0.24)),
-    "queen": turned(("drum", 0.6, 0.2), ("drum", 0.4, 0.9), ("drum", 0.25, 0.7), ("egg", 0.5, 0.5), ("egg", 0.2, 0.3)),
-    "king": turned(("drum", 0.6, 0.2), ("drum", 0.42, 1.6), ("egg", 0.5, 0.4), ("drum", 0.12, 0.5)),
-    "bottle": turned(("drum", 0.5, 0.2), ("drum", 0.5, 1.4), ("egg", 0.45, 0.4), ("drum", 0.18, 0.7)),
-    "vase": turned(("drum", 0.4, 0.2), ("egg", 0.6, 1.2), ("drum", 0.25, 0.4), ("drum", 0.4, 0.12)),
-    "candle": turned(("drum", 0.6, 0.2), ("drum", 0.55, 0.15), ("drum", 0.25, 1.5), ("egg", 0.1, 0.4)),
-    "lamp": turned(("drum", 0.55, 0.2), ("drum", 0.12, 1.2), ("drum", 0.6, 0.7)),
-    "goblet": turned(("drum", 0.55, 0.2), ("drum", 0.12, 0.8), ("egg", 0.55, 0.9)),
-    "mushroom": turned(("drum", 0.35, 0.2), ("drum", 0.3, 0.7), ("egg", 0.75, 0.7)),
-    "bell": turned(("drum", 0.75, 0.2), ("drum", 0.6, 0.5), ("egg", 0.5, 0.6), ("egg", 0.15, 0.3)),
-    "jar": turned(("drum", 0.6, 0.2), ("drum", 0.6, 1.2), ("drum", 0.45, 0.3)),
-    "barrel": turned(("drum", 0.6, 0.2), ("egg", 0.7, 1.8), ("drum", 0.5, 0.1)),
-    "lighthouse": turned(("drum", 0.6, 0.2), ("drum", 0.45, 1.2), ("drum", 0.32, 0.9), ("egg", 0.35, 0.5)),
-    "top": turned(("drum", 0.2, 0.2), ("egg", 0.8, 0.6), ("drum", 0.12, 0.6)),
-    "hat": turned(("drum", 0.9, 0.2), ("drum", 0.5, 0.7), ("egg", 0.5, 0.4)),
-    "cake": turned(("drum", 0.85, 0.2), ("drum", 0.8, 0.5), ("drum", 0.5, 0.45), ("drum", 0.1, 0.4)),
-    "snowman": turned(("drum", 0.65, 0.2), ("egg", 0.6, 0.9), ("egg", 0.45, 0.8), ("egg", 0.3, 0.6)),
-    "buoy": turned(("drum", 0.7, 0.2), ("egg", 0.7, 0.8), ("drum", 0.2, 0.8), ("egg", 0.2, 0.3)),
-    "plant": turned(("drum", 0.5, 0.2), ("drum", 0.55, 0.6), ("egg", 0.7, 1.1)),
-    "ice_cream": turned(("drum", 0.25, 0.2), ("drum", 0.3, 0.9), ("egg", 0.55, 0.9), ("egg", 0.15, 0.3)),
+    "pawn": turned(("cylinder", 0.55, 0.2), ("cylinder", 0.4, 0.7), ("cylinder", 0.22, 0.6), ("ellipsoid", 0.4, 0.7)),
+    "rook": turned(("cylinder", 0.6, 0.2), ("cylinder", 0.4, 1.4), ("cylinder", 0.55, 0.5)),
+    "bishop": turned(
+        ("cylinder", 0.55, 0.2), ("cylinder", 0.35, 0.7), ("ellipsoid", 0.42, 1.1), ("ellipsoid", 0.12, 0.24)
+    ),
+    "queen": turned(
+        ("cylinder", 0.6, 0.2),
+        ("cylinder", 0.4, 0.9),
+        ("cylinder", 0.25, 0.7),
+        ("ellipsoid", 0.5, 0.5),
+        ("ellipsoid", 0.2, 0.3),
+    ),
+    "king": turned(("cylinder", 0.6, 0.2), ("cylinder", 0.42, 1.6), ("ellipsoid", 0.5, 0.4), ("cylinder", 0.12, 0.5)),
+    "bottle": turned(("cylinder", 0.5, 0.2), ("cylinder", 0.5, 1.4), ("ellipsoid", 0.45, 0.4), ("cylinder", 0.18, 0.7)),
+    "vase": turned(("cylinder", 0.4, 0.2), ("ellipsoid", 0.6, 1.2), ("cylinder", 0.25, 0.4), ("cylinder", 0.4, 0.12)),
+    "candle": turned(
+        ("cylinder", 0.6, 0.2), ("cylinder", 0.55, 0.15), ("cylinder", 0.25, 1.5), ("ellipsoid", 0.1, 0.4)
+    ),
+    "lamp": turned(("cylinder", 0.55, 0.2), ("cylinder", 0.12, 1.2), ("cylinder", 0.6, 0.7)),
+    "goblet": turned(("cylinder", 0.55, 0.2), ("cylinder", 0.12, 0.8), ("ellipsoid", 0.55, 0.9)),
+    "mushroom": turned(("cylinder", 0.35, 0.2), ("cylinder", 0.3, 0.7), ("ellipsoid", 0.75, 0.7)),
+    "bell": turned(("cylinder", 0.75, 0.2), ("cylinder", 0.6, 0.5), ("ellipsoid", 0.5, 0.6), ("ellipsoid", 0.15, 0.3)),
+    "jar": turned(("cylinder", 0.6, 0.2), ("cylinder", 0.6, 1.2), ("cylinder", 0.45, 0.3)),
+    "barrel": turned(("cylinder", 0.6, 0.2), ("ellipsoid", 0.7, 1.8), ("cylinder", 0.5, 0.1)),
+    "lighthouse": turned(
+        ("cylinder", 0.6, 0.2), ("cylinder", 0.45, 1.2), ("cylinder", 0.32, 0.9), ("ellipsoid", 0.35, 0.5)
+    ),
+    "top": turned(("cylinder", 0.2, 0.2), ("ellipsoid", 0.8, 0.6), ("cylinder", 0.12, 0.6)),
+    "hat": turned(("cylinder", 0.9, 0.2), ("cylinder", 0.5, 0.7), ("ellipsoid", 0.5, 0.4)),
+    "cake": turned(("cylinder", 0.85, 0.2), ("cylinder", 0.8, 0.5), ("cylinder", 0.5, 0.45), ("cylinder", 0.1, 0.4)),
+    "snowman": turned(
+        ("cylinder", 0.65, 0.2), ("ellipsoid", 0.6, 0.9), ("ellipsoid", 0.45, 0.8), ("ellipsoid", 0.3, 0.6)
+    ),
+    "buoy": turned(("cylinder", 0.7, 0.2), ("ellipsoid", 0.7, 0.8), ("cylinder", 0.2, 0.8), ("ellipsoid", 0.2, 0.3)),
+    "plant": turned(("cylinder", 0.5, 0.2), ("cylinder", 0.55, 0.6), ("ellipsoid", 0.7, 1.1)),
+    "ice_cream": turned(
+        ("cylinder", 0.25, 0.2), ("cylinder", 0.3, 0.9), ("ellipsoid", 0.55, 0.9), ("ellipsoid", 0.15, 0.3)
+    ),
     "knight": shape(
         ball(0, 0, 0.6),
-        Drum(0, 0, 0.7, 0.4, 0.35),
-        Egg(0, 0.1, 1.5, 0.28, 0.4, 0.6),
-        Egg(0, 0.35, 1.85, 0.2, 0.4, 0.22),
+        Cylinder(0, 0, 0.7, 0.4, 0.35),
+        Ellipsoid(0, 0.1, 1.5, 0.28, 0.4, 0.6),
+        Ellipsoid(0, 0.35, 1.85, 0.2, 0.4, 0.22),
         Box(0, -0.3, 1.7, 0.08, 0.12, 0.4),
     ),
 }

@@ -1,11 +1,10 @@
 """Shapes of things on a table, built of a few primitives each.
 
-A shape lies on *parts*, which are what others touch: sticks and balls of the same kind, since a ball is a stick of no
-length. *Details* stand on the parts or between them, within their outline, and are only seen. Lengths are in units of
-the thing's size; the origin is anywhere, x and y are on the table and z is the height above it.
+A shape lies on horizontal capsules, some of no length: they are what others touch. Ellipsoids, boxes and upright
+cylinders stand on them and are only seen; from above they hardly reach beyond the capsules' outline. Lengths are in
+any unit; the origin is anywhere, x and y are on the table and z is the height above it.
 
-A shape has at most NUM_STICKS sticks and balls, NUM_EGGS eggs, NUM_BOXES boxes and NUM_DRUMS drums: every task has the
-same geoms, and what a shape does not use is hidden.
+Every task has the same geoms (SLOTS): what a shape does not use is hidden.
 """
 
 import dataclasses
@@ -14,13 +13,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-NUM_STICKS, NUM_EGGS, NUM_BOXES, NUM_DRUMS = 4, 3, 2, 4
-_FAR_BELOW = -10.0
+SLOTS = {"capsule": 4, "ellipsoid": 3, "box": 2, "cylinder": 4}
+"""The most primitives of each kind, by MuJoCo's names and in the order of a body's geoms."""
+NUM_CAPSULES = SLOTS["capsule"]
+_SPACING = 0.01
 _HALF = 0.5**0.5
 _SQUAT = 0.65
 
 
-class Stick(NamedTuple):
+class Capsule(NamedTuple):
     """A capsule that lies on the table, from (x0, y0) to (x1, y1); `seen` is whether it is visible."""
 
     x0: float
@@ -31,7 +32,7 @@ class Stick(NamedTuple):
     seen: bool = True
 
 
-class Egg(NamedTuple):
+class Ellipsoid(NamedTuple):
     """An ellipsoid: centre and half-axes."""
 
     x: float
@@ -54,7 +55,7 @@ class Box(NamedTuple):
     turn: float = 0.0
 
 
-class Drum(NamedTuple):
+class Cylinder(NamedTuple):
     """An upright cylinder: centre, radius and half-height."""
 
     x: float
@@ -69,47 +70,48 @@ class Shape:
     """What a thing looks like.
 
     Attributes:
-        sticks, eggs, boxes, drums: its primitives; at least one stick.
+        capsules, ellipsoids, boxes, cylinders: its primitives; at least one capsule.
     """
 
-    sticks: tuple[Stick, ...]
-    eggs: tuple[Egg, ...]
+    capsules: tuple[Capsule, ...]
+    ellipsoids: tuple[Ellipsoid, ...]
     boxes: tuple[Box, ...]
-    drums: tuple[Drum, ...]
+    cylinders: tuple[Cylinder, ...]
 
 
-def shape(*primitives: Stick | Egg | Box | Drum) -> Shape:
+def shape(*primitives: Capsule | Ellipsoid | Box | Cylinder) -> Shape:
     """A shape of these primitives.
 
     Raises:
-        ValueError: for too many of a kind, or no stick.
+        ValueError: for too many of a kind, or no capsule.
     """
-    limits: dict[type, int] = {Stick: NUM_STICKS, Egg: NUM_EGGS, Box: NUM_BOXES, Drum: NUM_DRUMS}
-    kinds = {kind: tuple(p for p in primitives if isinstance(p, kind)) for kind in limits}
-    for kind, limit in limits.items():
-        if len(kinds[kind]) > limit:
-            raise ValueError(f"shape: got {len(kinds[kind])} of {kind.__name__}, expected at most {limit}")
-    if not kinds[Stick]:
-        raise ValueError("shape: got no Stick, expected at least one: nothing could touch it")
-    return Shape(kinds[Stick], kinds[Egg], kinds[Box], kinds[Drum])  # type: ignore[arg-type]
+    kinds: dict[type, tuple] = {
+        kind: tuple(p for p in primitives if isinstance(p, kind)) for kind in (Capsule, Ellipsoid, Box, Cylinder)
+    }
+    for (kind, found), limit in zip(kinds.items(), SLOTS.values(), strict=True):
+        if len(found) > limit:
+            raise ValueError(f"shape: got {len(found)} of {kind.__name__}, expected at most {limit}")
+    if not kinds[Capsule]:
+        raise ValueError("shape: got no Capsule, expected at least one: nothing could touch it")
+    return Shape(kinds[Capsule], kinds[Ellipsoid], kinds[Box], kinds[Cylinder])
 
 
-def ball(x: float, y: float, radius: float) -> Stick:
-    """A stick of no length."""
-    return Stick(x, y, x, y, radius)
+def ball(x: float, y: float, radius: float) -> Capsule:
+    """A capsule of no length."""
+    return Capsule(x, y, x, y, radius)
 
 
 def strokes(text: str, radius: float = 0.22) -> Shape:
-    """Sticks between points "x,y", as in "-1,-1 0,1 1,-1" for a roof; "|" lifts the pen."""
-    sticks = []
+    """Capsules between points "x,y", as in "-1,-1 0,1 1,-1" for a roof; "|" lifts the pen."""
+    capsules = []
     for line in text.split("|"):
         points = [[float(v) for v in point.split(",")] for point in line.split()]
-        sticks += [Stick(x0, y0, x1, y1, radius) for (x0, y0), (x1, y1) in itertools.pairwise(points)]
-    return shape(*sticks)
+        capsules += [Capsule(x0, y0, x1, y1, radius) for (x0, y0), (x1, y1) in itertools.pairwise(points)]
+    return shape(*capsules)
 
 
 def turned(*profile: tuple[str, float, float]) -> Shape:
-    """A turned piece: eggs and drums on each other, (kind, radius, height) each, from the table upwards.
+    """A turned piece: ellipsoids and cylinders on each other, (kind, radius, height) each, from the table upwards.
 
     All of them are squat, so that they hide little of what stands behind them.
     """
@@ -118,84 +120,95 @@ def turned(*profile: tuple[str, float, float]) -> Shape:
         half = _SQUAT * height / 2
         middle = z + half
         primitives.append(
-            Drum(0, 0, middle, radius, half) if kind == "drum" else Egg(0, 0, middle, radius, radius, half)
+            Cylinder(0, 0, middle, radius, half)
+            if kind == "cylinder"
+            else Ellipsoid(0, 0, middle, radius, radius, half)
         )
         z += 2 * half
     outline = max(radius for _, radius, _ in profile)
-    return shape(Stick(0, 0, 0, 0, outline, seen=False), *primitives)
+    return shape(Capsule(0, 0, 0, 0, outline, seen=False), *primitives)
 
 
 class Geoms(NamedTuple):
     """A shape as geoms of a body whose origin is the centre of the outline's area, on the table.
 
-    P = NUM_STICKS + NUM_EGGS + NUM_BOXES + NUM_DRUMS, in this order. The unit of length lies halfway (as a
-    geometric mean) between the radius of a disc of the outline's area and the distance to its farthest point.
+    P is the sum of SLOTS. The unit of length is the geometric mean of two radii: that of a disc of the outline's
+    area, and the distance of its farthest point from the origin.
 
     Attributes:
-        pos: [P, 3]; what is not used lies far below the table.
+        pos: [P, 3].
         quat: [P, 4].
-        size: [P, 3], by MuJoCo's conventions for capsules, ellipsoids, boxes and cylinders.
-        seen: [P] bool.
-        gyration: mean squared distance of the outline's area from the origin.
+        size: [P, 3], by MuJoCo's conventions for each kind.
+        used: [P] bool, whether there is such a geom; the others are to be kept out of the way.
+        seen: [P] bool, whether it is visible.
+        squared_gyration: mean squared distance of the outline's area from the origin.
     """
 
     pos: np.ndarray
     quat: np.ndarray
     size: np.ndarray
+    used: np.ndarray
     seen: np.ndarray
-    gyration: float
+    squared_gyration: float
 
 
-def geoms(shape: Shape) -> Geoms:
+def to_geoms(shape: Shape) -> Geoms:
     """The geoms of a shape, centred and scaled."""
-    centre, gyration, unit = _outline(shape.sticks)
-    rows: list[tuple[list[float], list[float], list[float], bool]] = []
-    for limit, primitives in (
-        (NUM_STICKS, shape.sticks),
-        (NUM_EGGS, shape.eggs),
-        (NUM_BOXES, shape.boxes),
-        (NUM_DRUMS, shape.drums),
-    ):
-        rows += [_geom(primitive) for primitive in primitives]
-        rows += [([0, 0, _FAR_BELOW], [1, 0, 0, 0], [0.01] * 3, False)] * (limit - len(primitives))
-    pos, quat, size, seen = (np.array(column) for column in zip(*rows, strict=True))
-    used = pos[:, 2] != _FAR_BELOW
+    centre, squared_gyration, unit = _outline(shape.capsules)
+    kinds: tuple[tuple, ...] = (shape.capsules, shape.ellipsoids, shape.boxes, shape.cylinders)
+    rows: list[tuple[list[float], list[float], list[float], bool, bool]] = []
+    for limit, primitives in zip(SLOTS.values(), kinds, strict=True):
+        rows += [(*_to_geom(p), True, not isinstance(p, Capsule) or p.seen) for p in primitives]
+        rows += [([0, 0, 0], [1, 0, 0, 0], [unit] * 3, False, False)] * (limit - len(primitives))
+    pos, quat, size, used, seen = (np.array(column) for column in zip(*rows, strict=True))
     pos[used, :2] -= centre
-    return Geoms(pos / unit, quat, size / unit, seen, gyration / unit**2)
+    return Geoms(pos / unit, quat, size / unit, used, seen, squared_gyration / unit**2)
 
 
-def _geom(p: Stick | Egg | Box | Drum) -> tuple[list[float], list[float], list[float], bool]:
-    """Position, quaternion, size and visibility of a primitive."""
-    if isinstance(p, Stick):
-        dx, dy = p.x1 - p.x0, p.y1 - p.y0
-        length = float(np.hypot(dx, dy))
-        half_turn = [-dy / length * _HALF, dx / length * _HALF] if length else [0.0, 0.0]
-        quat = [_HALF if length else 1.0, *half_turn, 0.0]
-        return [(p.x0 + p.x1) / 2, (p.y0 + p.y1) / 2, p.radius], quat, [p.radius, length / 2, 0.0], p.seen
+def to_outline(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
+    """Ends [NUM_CAPSULES, 2, 2] and radii [NUM_CAPSULES] of a shape's capsules, centred and scaled as `to_geoms` does.
+
+    Where there are fewer, the first one stands in for the others: it changes neither union nor greatest distance.
+    """
+    centre, _, unit = _outline(shape.capsules)
+    capsules = shape.capsules + shape.capsules[:1] * (NUM_CAPSULES - len(shape.capsules))
+    ends = np.array([[[c.x0, c.y0], [c.x1, c.y1]] for c in capsules], float)
+    return (ends - centre) / unit, np.array([c.radius for c in capsules]) / unit
+
+
+def _to_geom(p: Capsule | Ellipsoid | Box | Cylinder) -> tuple[list[float], list[float], list[float]]:
+    """Position, quaternion and size of a primitive."""
     upright = [1.0, 0.0, 0.0, 0.0]
-    if isinstance(p, Box):
-        turned = [float(np.cos(p.turn / 2)), 0.0, 0.0, float(np.sin(p.turn / 2))]
-        return [p.x, p.y, p.z], turned, [p.a, p.b, p.c], True
-    size = [p.a, p.b, p.c] if isinstance(p, Egg) else [p.radius, p.half, 0.0]
-    return [p.x, p.y, p.z], upright, size, True
+    match p:
+        case Capsule():
+            dx, dy = p.x1 - p.x0, p.y1 - p.y0
+            length = float(np.hypot(dx, dy))
+            lying = [_HALF, -dy / length * _HALF, dx / length * _HALF, 0.0] if length else upright
+            return [(p.x0 + p.x1) / 2, (p.y0 + p.y1) / 2, p.radius], lying, [p.radius, length / 2, 0.0]
+        case Ellipsoid():
+            return [p.x, p.y, p.z], upright, [p.a, p.b, p.c]
+        case Box():
+            return [p.x, p.y, p.z], [float(np.cos(p.turn / 2)), 0.0, 0.0, float(np.sin(p.turn / 2))], [p.a, p.b, p.c]
+        case Cylinder():
+            return [p.x, p.y, p.z], upright, [p.radius, p.half, 0.0]
 
 
-def _outline(sticks: tuple[Stick, ...], spacing: float = 0.01) -> tuple[np.ndarray, float, float]:
-    """Centre [2] of the area that the sticks cover, its mean squared distance from there, and the unit of length."""
-    ends = np.array([[[s.x0, s.y0], [s.x1, s.y1]] for s in sticks], float)
-    radius = np.array([s.radius for s in sticks])
+def _outline(capsules: tuple[Capsule, ...]) -> tuple[np.ndarray, float, float]:
+    """Centre [2] of the area that the capsules cover, its mean squared distance from there, and the unit of length."""
+    ends = np.array([[[s.x0, s.y0], [s.x1, s.y1]] for s in capsules], float)
+    radius = np.array([s.radius for s in capsules])
     low, high = (ends.min(axis=(0, 1)) - radius.max(), ends.max(axis=(0, 1)) + radius.max())
-    grid = np.stack(np.meshgrid(*(np.arange(a, b, spacing) for a, b in zip(low, high, strict=True))), axis=-1)
+    grid = np.stack(np.meshgrid(*(np.arange(a, b, _SPACING) for a, b in zip(low, high, strict=True))), axis=-1)
     covered = grid[(distance_to_outline(grid, ends, radius) <= 0)]
     centre = covered.mean(axis=0)
-    gyration = float(np.square(covered - centre).sum(axis=-1).mean())
+    squared_gyration = float(np.square(covered - centre).sum(axis=-1).mean())
     reach = (np.linalg.norm(ends - centre, axis=-1).max(axis=-1) + radius).max()
-    disc = (len(covered) * spacing**2 / np.pi) ** 0.5
-    return centre, gyration, float((reach * disc) ** 0.5)
+    disc = (len(covered) * _SPACING**2 / np.pi) ** 0.5
+    return centre, squared_gyration, float((reach * disc) ** 0.5)
 
 
 def distance_to_outline(points: np.ndarray, ends: np.ndarray, radius: np.ndarray) -> np.ndarray:
-    """[...] signed distance of points [..., 2] to the union of sticks with ends [N, 2, 2] and radii [N]."""
+    """[...] signed distance of points [..., 2] to the union of capsules with ends [N, 2, 2] and radii [N]."""
     along = ends[:, 1] - ends[:, 0]
     offset = points[..., None, :] - ends[:, 0]
     t = np.clip((offset * along).sum(axis=-1) / np.maximum(np.square(along).sum(axis=-1), 1e-12), 0, 1)
