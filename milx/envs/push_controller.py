@@ -22,6 +22,9 @@ SIDE = 0.035
 """The hand is behind the object if it is less than this off the line from the goal through the object (m)."""
 NEAR = 0.025
 """The hand comes down when it is closer than this to its place behind the object (m)."""
+ARRIVED, BEYOND = 0.03, 0.03
+"""The hand keeps still once the object is this close to the goal's centre, or this far beyond it, where the hand does
+not follow (m)."""
 TRAVEL_SPEED, PUSH_SPEED, VERTICAL_SPEED = 0.8, 0.3, 0.6
 """m/s."""
 TORQUE = 2.0
@@ -56,8 +59,8 @@ def act(
     far = jnp.linalg.norm(to_place) > NEAR
     risen = jnp.where(far, jnp.clip((tip[2] - 0.05) / 0.06, 0, 1), 1.0)
     travel = risen * _at_most(5.0 * to_place, TRAVEL_SPEED)
-    speed = jnp.where(away < 0.015, 0.0, PUSH_SPEED * jnp.clip(away / 0.06, 0, 1))
-    push = speed * ahead - jnp.where(away < 0.015, 0.0, 6.0) * side * across
+    speed = PUSH_SPEED * jnp.clip(away / 0.06, 0, 1)
+    push = speed * ahead - 6.0 * side * across
     height = jnp.where(pushing | ~far, LOW, HIGH)
     wanted = jnp.concatenate(
         [
@@ -67,10 +70,12 @@ def act(
             6.0 * (jnp.array([0.0, 0.0, -1.0]) - pose[6:9]),
         ]
     )
+    still = (away < ARRIVED) | (place[0] > BEYOND)
+    wanted = jnp.where(still, 0.0, wanted)
     weighted = jnp.array(_WEIGHTS)[:, None] * jacobian
     normal = jacobian.T @ weighted + _REGULARISATION * jnp.eye(7)
     joint_velocity = boxqp.solve_free(normal, weighted.T @ wanted, jnp.ones(7, bool))
-    force = jnp.where(pushing, friction * speed, 0.0) * ahead
+    force = jnp.where(pushing & ~still, friction * speed, 0.0) * ahead
     torque = _DAMPING * joint_velocity + jnp.array(_FEEDBACK) * (joint_velocity - velocity) + jacobian[:2].T @ force
     return jnp.clip(torque / TORQUE, -1, 1)
 
