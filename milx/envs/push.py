@@ -12,7 +12,7 @@ from mujoco import mjx
 from milx.envs import push_controller
 from milx.envs.base import ASSETS, Env, State, check_split
 from milx.envs.shapes import SHAPES, SPLITS
-from milx.envs.shapes.primitives import NUM_CAPSULES, SLOTS, to_geoms, to_outline
+from milx.envs.shapes.primitives import NUM_CAPSULES, SLOTS, Geoms, to_geoms
 
 GOAL_RADIUS = 0.08
 """The red disc's (m); its centre is at x = y = 0."""
@@ -86,12 +86,8 @@ class Push(Env):
         self._body = np.array([model.body(name).id for name in _OBJECTS])
         self._dof = np.array([model.jnt_dofadr[model.body_jntadr[body]] + np.arange(3) for body in self._body])
         self._geom = np.array([model.body_geomadr[body] + np.arange(model.body_geomnum[body]) for body in self._body])
-        columns = zip(*(to_geoms(shape) for shape in SHAPES.values()), strict=True)
-        self._pos, self._quat, self._size, self._used, self._seen, self._squared_gyration = (
-            jnp.asarray(np.array(column)) for column in columns
-        )
-        outlines = [to_outline(shape) for shape in SHAPES.values()]
-        self._ends, self._radius = (jnp.asarray(np.array(column)) for column in zip(*outlines, strict=True))
+        shapes = [to_geoms(shape) for shape in SHAPES.values()]
+        self._shapes = jax.tree.map(lambda *x: jnp.asarray(np.array(x)), *shapes)
 
     def sample_task(self, key: jax.Array, split: str) -> PushTask:
         """Draws two different shapes of the split, their sizes, masses, friction and colours, and the target.
@@ -143,17 +139,17 @@ class Push(Env):
     @functools.partial(jax.jit, static_argnums=0)
     def model_of(self, task: PushTask) -> mjx.Model:
         """The model with the task's objects: their geoms, masses, inertias and friction."""
-        model, unit = self.model, task.size[:, None, None]
+        model, unit, shapes = self.model, task.size[:, None, None], self._shapes_of(task)
         objects, geoms, dofs = self._body, self._geom, self._dof
         # A plate on a viscous table: what holds for a point holds for turning, times the mean squared lever.
-        lever = self._squared_gyration[task.shape] * task.size**2
+        lever = shapes.squared_gyration * task.size**2
         inertia = task.mass * lever
         inverse = jnp.stack([2 / task.mass, 1 / inertia], axis=-1) / 3  # of two slides and one hinge, over three axes
-        pos = jnp.where(self._used[task.shape][..., None], unit * self._pos[task.shape], jnp.array(_OUT_OF_THE_WAY))
+        pos = jnp.where(shapes.used[..., None], unit * shapes.pos, jnp.array(_OUT_OF_THE_WAY))
         return model.replace(
             geom_pos=model.geom_pos.at[geoms].set(pos),
-            geom_quat=model.geom_quat.at[geoms].set(self._quat[task.shape]),
-            geom_size=model.geom_size.at[geoms].set(unit * self._size[task.shape]),
+            geom_quat=model.geom_quat.at[geoms].set(shapes.quat),
+            geom_size=model.geom_size.at[geoms].set(unit * shapes.size),
             body_mass=model.body_mass.at[objects].set(task.mass),
             body_subtreemass=model.body_subtreemass.at[objects].set(task.mass),
             body_inertia=model.body_inertia.at[objects].set(inertia[:, None]),
@@ -162,6 +158,10 @@ class Push(Env):
                 task.damping[:, None] * jnp.stack([jnp.ones(2), jnp.ones(2), lever], axis=-1)
             ),
         )
+
+    def _shapes_of(self, task: PushTask) -> Geoms:
+        """The geoms of the task's two objects, with a leading axis of 2."""
+        return jax.tree.map(lambda x: x[task.shape], self._shapes)
 
     def objects(self, state: State) -> jax.Array:
         """[2, 3] x, y (m) and turn (rad) of both objects."""
@@ -180,7 +180,7 @@ class Push(Env):
 
     def colors(self, task: PushTask) -> jax.Array:
         """[G, 4] RGBA of every geom; what a shape does not use is transparent."""
-        seen = self._seen[task.shape].astype(float)
+        seen = self._shapes_of(task).seen.astype(float)
         color = jnp.broadcast_to(task.color[:, None], (*seen.shape, 3))
         return self._rgba.at[self._geom].set(jnp.concatenate([color, seen[..., None]], axis=-1))
 
@@ -202,8 +202,8 @@ class Push(Env):
         backwards = place / jnp.maximum(jnp.linalg.norm(place), 0.02)
         cos, sin = jnp.cos(turn), jnp.sin(turn)
         direction = jnp.array([[cos, sin], [-sin, cos]]) @ backwards
-        ends, radius = self._ends[task.shape[target]], self._radius[task.shape[target]]
-        back = task.size[target] * (jnp.max(ends @ direction, axis=-1) + radius).max()
+        shape = jax.tree.map(lambda x: x[target], self._shapes_of(task))
+        back = task.size[target] * (jnp.max(shape.ends @ direction, axis=-1) + shape.radius).max()
         return push_controller.act(pose, jacobian, state.qvel[:NUM_JOINTS], place, back, task.damping[target])
 
     def running_residual(self, task: PushTask, state: State, action: jax.Array, t: jax.Array) -> jax.Array:

@@ -139,7 +139,7 @@ def test_the_image_is_that_of_the_tasks_own_model(env, task):
     frame = jax.jit(renderer.render)(renderer.scene(data))
     np.testing.assert_allclose(env.render(task, state).astype(int), to_uint8(frame.color).astype(int), atol=1)
     visible = set(np.unique(frame.geom_id))
-    used = [set(env._geom[i][np.asarray(env._seen[task.shape[i]])]) for i in range(2)]
+    used = [set(env._geom[i][np.asarray(env._shapes_of(task).seen[i])]) for i in range(2)]
     assert all(visible & geoms for geoms in used)
     assert not visible & (set(env._geom.ravel()) - used[0] - used[1])
 

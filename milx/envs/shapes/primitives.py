@@ -142,6 +142,8 @@ class Geoms(NamedTuple):
         used: [P] bool, whether there is such a geom; the others are to be kept out of the way.
         seen: [P] bool, whether it is visible.
         squared_gyration: mean squared distance of the outline's area from the origin.
+        ends: [NUM_CAPSULES, 2, 2] x and y of the capsules' ends; the first one stands in for those that are not used.
+        radius: [NUM_CAPSULES] of the capsules.
     """
 
     pos: np.ndarray
@@ -150,6 +152,8 @@ class Geoms(NamedTuple):
     used: np.ndarray
     seen: np.ndarray
     squared_gyration: float
+    ends: np.ndarray
+    radius: np.ndarray
 
 
 def to_geoms(shape: Shape) -> Geoms:
@@ -162,18 +166,9 @@ def to_geoms(shape: Shape) -> Geoms:
         rows += [([0, 0, 0], [1, 0, 0, 0], [unit] * 3, False, False)] * (limit - len(primitives))
     pos, quat, size, used, seen = (np.array(column) for column in zip(*rows, strict=True))
     pos[used, :2] -= centre
-    return Geoms(pos / unit, quat, size / unit, used, seen, squared_gyration / unit**2)
-
-
-def to_outline(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
-    """Ends [NUM_CAPSULES, 2, 2] and radii [NUM_CAPSULES] of a shape's capsules, centred and scaled as `to_geoms` does.
-
-    Where there are fewer, the first one stands in for the others: it changes neither union nor greatest distance.
-    """
-    centre, _, unit = _outline(shape.capsules)
-    capsules = shape.capsules + shape.capsules[:1] * (NUM_CAPSULES - len(shape.capsules))
-    ends = np.array([[[c.x0, c.y0], [c.x1, c.y1]] for c in capsules], float)
-    return (ends - centre) / unit, np.array([c.radius for c in capsules]) / unit
+    ends, radius = _ends(shape.capsules + shape.capsules[:1] * (NUM_CAPSULES - len(shape.capsules)))
+    squared_gyration /= unit**2
+    return Geoms(pos / unit, quat, size / unit, used, seen, squared_gyration, (ends - centre) / unit, radius / unit)
 
 
 def _to_geom(p: Capsule | Ellipsoid | Box | Cylinder) -> tuple[list[float], list[float], list[float]]:
@@ -193,10 +188,15 @@ def _to_geom(p: Capsule | Ellipsoid | Box | Cylinder) -> tuple[list[float], list
             return [p.x, p.y, p.z], upright, [p.radius, p.half, 0.0]
 
 
+def _ends(capsules: tuple[Capsule, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Ends [N, 2, 2] and radii [N] of N capsules."""
+    ends = np.array([[[c.x0, c.y0], [c.x1, c.y1]] for c in capsules], float)
+    return ends, np.array([c.radius for c in capsules])
+
+
 def _outline(capsules: tuple[Capsule, ...]) -> tuple[np.ndarray, float, float]:
     """Centre [2] of the area that the capsules cover, its mean squared distance from there, and the unit of length."""
-    ends = np.array([[[s.x0, s.y0], [s.x1, s.y1]] for s in capsules], float)
-    radius = np.array([s.radius for s in capsules])
+    ends, radius = _ends(capsules)
     low, high = (ends.min(axis=(0, 1)) - radius.max(), ends.max(axis=(0, 1)) + radius.max())
     grid = np.stack(np.meshgrid(*(np.arange(a, b, _SPACING) for a, b in zip(low, high, strict=True))), axis=-1)
     covered = grid[(distance_to_outline(grid, ends, radius) <= 0)]
