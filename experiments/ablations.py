@@ -23,6 +23,7 @@ ABLATIONS: dict[str, dict[str, Any]] = {
     "3 inner steps": {"mil.inner_steps": 3},
     "5 inner steps": {"mil.inner_steps": 5},
     "two heads": {"network.heads": 2},
+    "convolutions in float32": {"network.mixed_precision": False},
     "no goal head": {"network.goal_head": False, "mil.goal_weight": 0.0},
 }
 

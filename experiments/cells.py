@@ -36,7 +36,14 @@ STEPS = {"reach": 16_000, "reach_state": 4_000}
 
 
 def methods_of(env: str, chosen: list[str] | None) -> list[str]:
-    """The methods of an environment, or those of them that were chosen."""
+    """The methods of an environment, or those of them that were chosen.
+
+    Raises:
+        ValueError: for a method that no environment compares; the message lists those that are.
+    """
+    compared = sorted(set(itertools.chain(*METHODS.values())))
+    if unknown := sorted(set(chosen or ()) - set(compared)):
+        raise ValueError(f"methods: got {unknown[0]!r}, expected some of {', '.join(compared)}")
     return [method for method in METHODS[env] if chosen is None or method in chosen]
 
 

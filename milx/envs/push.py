@@ -34,6 +34,7 @@ NUM_JOINTS = 7
 _START = (0.0, -0.895, 0.0, 2.397, 0.0, 0.069, 0.0)
 _OUT_OF_THE_WAY = (0.0, 0.0, -10.0)
 OBJECT_COST, TIP_COST, ACTION_COST, FINAL_COST = 1.0, 0.5, 0.1, 10.0
+"""Weights of the residuals: 1/m, but for the action, which has no unit."""
 _OBJECTS = ("object_0", "object_1")
 _PRONGS = ("prong_left", "prong_middle", "prong_right")
 _CANDIDATES = 64
@@ -82,6 +83,7 @@ class Push(Env):
         super().__init__(_build(), image_shape)
         model = self.mj_model
         self._rgba = jnp.asarray(model.geom_rgba, float)
+        self._prong = float(model.geom("prong_middle").size[0])
         self._tip, self._hand = model.site("tip").id, model.body("hand").id
         self._body = np.array([model.body(name).id for name in _OBJECTS])
         self._dof = np.array([model.jnt_dofadr[model.body_jntadr[body]] + np.arange(3) for body in self._body])
@@ -199,12 +201,15 @@ class Push(Env):
         x, y, turn = self.objects(state)[target]
         pose, jacobian = self.hand(state.qpos), jax.jacfwd(self.hand)(state.qpos)[:, :NUM_JOINTS]
         place = jnp.stack([x, y])
-        backwards = place / jnp.maximum(jnp.linalg.norm(place), 0.02)
+        ahead = -place / jnp.maximum(jnp.linalg.norm(place), 0.02)
         cos, sin = jnp.cos(turn), jnp.sin(turn)
-        direction = jnp.array([[cos, sin], [-sin, cos]]) @ backwards
+        backwards = -jnp.array([[cos, sin], [-sin, cos]]) @ ahead  # as the object sees it
         shape = jax.tree.map(lambda x: x[target], self._shapes_of(task))
-        back = task.size[target] * (jnp.max(shape.ends @ direction, axis=-1) + shape.radius).max()
-        return push_controller.act(pose, jacobian, state.qvel[:NUM_JOINTS], place, back, task.damping[target])
+        outline = task.size[target] * (jnp.max(shape.ends @ backwards, axis=-1) + shape.radius).max()
+        joints, velocity = self.model.dof_damping[:NUM_JOINTS], state.qvel[:NUM_JOINTS]
+        touching, friction = outline + self._prong, task.damping[target]
+        torque = push_controller.torque(pose, jacobian, velocity, joints, place, ahead, touching, friction)
+        return jnp.clip(torque / self.mj_model.actuator_gear[:, 0], *self.action_range)
 
     def running_residual(self, task: PushTask, state: State, action: jax.Array, t: jax.Array) -> jax.Array:
         """[11] object off goal, tip off object (m), and action, weighted.

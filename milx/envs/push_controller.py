@@ -10,8 +10,6 @@ import jax.numpy as jnp
 
 from milx.trajopt import boxqp
 
-PRONG = 0.009
-"""Radius of the hand's prongs (m)."""
 HIGH, LOW = 0.15, 0.008
 """Heights of the tip when it travels and when it pushes (m)."""
 LIFTED = 0.06
@@ -27,35 +25,40 @@ ARRIVED, BEYOND = 0.03, 0.03
 not follow (m)."""
 TRAVEL_SPEED, PUSH_SPEED, VERTICAL_SPEED = 0.8, 0.3, 0.6
 """m/s."""
-TORQUE = 2.0
-"""Of a motor at an action of 1 (N m)."""
-_DAMPING, _FEEDBACK = 1.0, (4.0, 4.0, 2.0, 3.0, 1.0, 1.0, 0.6)  # N m s/rad: the joints' own, and the controller's
+_FEEDBACK = (4.0, 4.0, 2.0, 3.0, 1.0, 1.0, 0.6)  # on the joints' velocities (N m s/rad)
 _WEIGHTS = (1.0, 1.0, 1.0, *(0.03,) * 6)  # of the tip's velocity, and of the two directions'
 _REGULARISATION = 2e-3
 
 
-def act(
-    pose: jax.Array, jacobian: jax.Array, velocity: jax.Array, place: jax.Array, back: jax.Array, friction: jax.Array
+def torque(
+    pose: jax.Array,
+    jacobian: jax.Array,
+    velocity: jax.Array,
+    damping: jax.Array,
+    place: jax.Array,
+    ahead: jax.Array,
+    touching: jax.Array,
+    friction: jax.Array,
 ) -> jax.Array:
-    """The action [7], in [-1, 1], for one time step.
+    """Torques of the joints [7] (N m) for one time step.
 
     Args:
         pose: [9] tip position (m), unit vectors in which the hand pushes and in which its prongs point.
         jacobian: [9, 7] of the pose by the joint angles.
         velocity: [7] of the joints (rad/s).
+        damping: [7] of the joints (N m s/rad).
         place: [2] of the object's centre (m); the goal is at 0.
-        back: distance from the object's centre to its outline, away from the goal (m).
+        ahead: [2] unit vector from the object's centre to the goal.
+        touching: how far behind the object's centre the tip is when it touches the object (m).
         friction: of the object against sliding (N s/m).
     """
     tip, away = pose[:3], jnp.linalg.norm(place)
-    ahead = -place / jnp.maximum(away, 0.02)
     across = jnp.array([-ahead[1], ahead[0]])
     along, side = (tip[:2] - place) @ ahead, (tip[:2] - place) @ across
-    touching = -(back + PRONG)
-    behind = (along < 0) & (along > touching - 0.1) & (jnp.abs(side) < SIDE)
+    behind = (along < 0) & (along > -touching - 0.1) & (jnp.abs(side) < SIDE)
     pushing = behind & (tip[2] < LIFTED)
 
-    to_place = place + (touching - MARGIN) * ahead - tip[:2]
+    to_place = place - (touching + MARGIN) * ahead - tip[:2]
     far = jnp.linalg.norm(to_place) > NEAR
     risen = jnp.where(far, jnp.clip((tip[2] - 0.05) / 0.06, 0, 1), 1.0)
     travel = risen * _at_most(5.0 * to_place, TRAVEL_SPEED)
@@ -76,8 +79,8 @@ def act(
     normal = jacobian.T @ weighted + _REGULARISATION * jnp.eye(7)
     joint_velocity = boxqp.solve_free(normal, weighted.T @ wanted, jnp.ones(7, bool))
     force = jnp.where(pushing & ~still, friction * speed, 0.0) * ahead
-    torque = _DAMPING * joint_velocity + jnp.array(_FEEDBACK) * (joint_velocity - velocity) + jacobian[:2].T @ force
-    return jnp.clip(torque / TORQUE, -1, 1)
+    feedback = jnp.array(_FEEDBACK) * (joint_velocity - velocity)
+    return damping * joint_velocity + feedback + jacobian[:2].T @ force
 
 
 def _at_most(velocity: jax.Array, speed: float) -> jax.Array:

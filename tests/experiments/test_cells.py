@@ -40,3 +40,9 @@ def test_bad_cells_are_refused_before_anything_is_planned(tmp_path):
     with pytest.raises(ValueError, match=r"train\.eval_every: got 3, expected a positive multiple"):
         runner.run("cell", config)
     assert not list(tmp_path.iterdir())
+
+
+def test_an_unknown_method_is_refused():
+    assert cells.methods_of("reach", ["lstm", "lstm_attention"]) == ["lstm"]  # no attention over pixels
+    with pytest.raises(ValueError, match="methods: got 'ltsm', expected some of contextual, lstm, lstm_attention, mil"):
+        cells.methods_of("reach", ["ltsm"])
