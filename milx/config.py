@@ -58,8 +58,8 @@ class NetworkConfig:
         fc_init_std: standard deviation of their first weights; None for LeCun's initialisation.
         bias_transformation: size of the learned vector beside the first fully connected layer's input; 0 for none.
         heads: 1, or 2 for a separate output layer in the inner loss.
-        goal_head: predict where the episode ends, from the image, and show the prediction to the layers after it
-            (`milx.networks.goal`).
+        goal_head: predict where the episode ends, from the image, or from the state where the policy sees no pixels,
+            and show the prediction to the layers after it (`milx.networks.goal`).
         context: size of the vector that methods without adaptation keep of a demonstration: units of the LSTM.
         context_frames: time steps of a demonstration that an LSTM reads.
     """
@@ -235,10 +235,10 @@ def _reach_state_cpu() -> Config:
 
 
 def _without_pixels(config: Config) -> Config:
-    """Neither convolutions nor goal head, but all time steps, which cost little now."""
+    """No convolutions, but all time steps, which cost little now."""
     network = config.network
     network.filters = network.strides = ()
-    network.soft_argmax = network.goal_head = network.mixed_precision = False
+    network.soft_argmax = network.mixed_precision = False
     config.train.support_frames = config.train.query_frames = None
     return config
 

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from milx.config import NetworkConfig
+from milx.networks.goal import StateGoalHead
 from milx.networks.layers import Dense
 from milx.networks.policy import Controller, ConvStack, PolicyOutput
 from milx.types import Params
@@ -82,8 +83,9 @@ class Actor(nn.Module):
         features = query = None
         if image is not None:
             features = ConvStack(self.config, name="vision")(image, state.dtype)
-            if self.config.goal_head:
-                query = jnp.broadcast_to(Dense(features.shape[-1])(context), (len(state), features.shape[-1]))
+        if self.config.goal_head:
+            size = StateGoalHead.candidates if features is None else features.shape[-1]
+            query = jnp.broadcast_to(Dense(size)(context), (len(state), size))
         controller = Controller(self.config, self.action_size, self.goal_size, name="controller")
         return controller(features, state, jnp.broadcast_to(context, (len(state), *context.shape)), query)
 

@@ -10,7 +10,7 @@ All this waits until the votes are about right: from zero, one seed found them w
 2,000. So they start from the camera's calibration where it is known (`calibrate`), and are learned from there on.
 """
 
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import flax.linen as nn
 import jax
@@ -25,7 +25,7 @@ class Goal(NamedTuple):
 
     Attributes:
         log_weight: [B, P] logarithms of the weights of the P positions.
-        vote: [P, G] their means.
+        vote: [P, G] or [B, P, G] their means.
         log_std: scalar, logarithm of their common standard deviation.
     """
 
@@ -36,7 +36,7 @@ class Goal(NamedTuple):
     @property
     def mean(self) -> jax.Array:
         """[B, G] the expected goal."""
-        return jnp.exp(self.log_weight) @ self.vote
+        return (jnp.exp(self.log_weight)[:, None] @ self.vote)[:, 0]
 
     def negative_log_likelihood(self, goal: jax.Array) -> jax.Array:
         """[B] of goals [B, G]."""
@@ -68,6 +68,31 @@ class GoalHead(nn.Module):
         centre = positions(height, width) * (1 - 1 / jnp.array([width, height]))
         place = jnp.append(centre, jnp.ones((height * width, 1)), axis=-1)
         vote = place @ self.param("vote", nn.initializers.zeros, (3, self.size))
+        return Goal(jax.nn.log_softmax(heat), vote, self.param("log_std", nn.initializers.zeros, ()))
+
+
+class StateGoalHead(nn.Module):
+    """Maps states [B, S] to a `Goal` where the policy sees no pixels: a few votes, each affine in the state.
+
+    The inner step turns the votes' weights, which are the same for all states, towards what was shown. There are more
+    votes than things to vote for: with as many (3), one of them stayed without a thing and the rest without a task.
+
+    Attributes:
+        size: G.
+    """
+
+    size: int
+    candidates: ClassVar[int] = 8
+
+    @nn.compact
+    def __call__(self, state: jax.Array, query: jax.Array | None = None) -> Goal:
+        """`query` [B, candidates] is added to the logarithms of the weights."""
+        heat = jnp.broadcast_to(
+            self.param("heat", nn.initializers.zeros, (self.candidates,)), (len(state), self.candidates)
+        )
+        if query is not None:
+            heat += query
+        vote = nn.DenseGeneral((self.candidates, self.size), param_dtype=state.dtype, name="vote")(state)
         return Goal(jax.nn.log_softmax(heat), vote, self.param("log_std", nn.initializers.zeros, ()))
 
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from milx.config import NetworkConfig
-from milx.networks.goal import Goal, GoalHead
+from milx.networks.goal import Goal, GoalHead, StateGoalHead
 from milx.networks.layers import ConvBlock, Dense, SpatialSoftArgmax
 from milx.types import Params
 
@@ -61,7 +61,7 @@ class Controller(nn.Module):
     Attributes:
         config: layers and heads.
         action_size: A.
-        goal_size: G.
+        goal_size: G; 0 for no goal head whatever `config` says.
     """
 
     config: NetworkConfig
@@ -78,16 +78,17 @@ class Controller(nn.Module):
             features: [B, H, W, C]; None where the policy sees no pixels.
             state: [B, S] whitened.
             context: [B, D], joins the input of the first fully connected layer.
-            query: [B, C], joins the goal head's filter; None for none.
+            query: [B, C] or, without features, [B, candidates]: tells the goal head what to look for; None for nothing.
         """
         config, goal = self.config, None
-        parts = [state, context]
+        parts, has_goal = [state, context], config.goal_head and self.goal_size
         if features is not None:
             seen = SpatialSoftArgmax()(features) if config.soft_argmax else features.reshape(len(features), -1)
             parts = [seen, *parts]
-            if config.goal_head:
-                goal = GoalHead(self.goal_size, name="goal_head")(features, query)
-                parts.append(goal.mean)
+        if has_goal:
+            head, on = (StateGoalHead, state) if features is None else (GoalHead, features)
+            goal = head(self.goal_size, name="goal_head")(on, query)
+            parts.append(goal.mean)
         x = jnp.concatenate(parts, axis=-1)
         for size in config.fc_layers:
             x = Dense(size, hidden=True, norm=config.fc_norm, init_std=config.fc_init_std)(x)

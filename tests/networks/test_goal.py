@@ -6,7 +6,7 @@ import numpy as np
 from scipy.special import softmax
 from scipy.stats import multivariate_normal
 
-from milx.networks.goal import Goal, GoalHead
+from milx.networks.goal import Goal, GoalHead, StateGoalHead
 from milx.networks.layers import positions
 
 BATCH, HEIGHT, WIDTH, CHANNELS, GOAL = 5, 3, 4, 6, 2
@@ -45,6 +45,27 @@ def test_gradient_in_the_filter_is_the_mean_feature_less_the_feature_where_the_g
     expected = np.einsum("bp,bpc->c", prior - posterior, features.reshape(BATCH, -1, CHANNELS))
     np.testing.assert_allclose(gradient, expected, rtol=1e-10)
     assert np.abs(expected).min() > 1e-2
+
+
+def test_gradient_in_the_weights_of_states_votes_is_their_prior_less_their_posterior(rng):
+    """Each state has its own votes, all states share their weights; from equal weights a step favours what was near."""
+    state, goal = rng.standard_normal((BATCH, 7)), rng.standard_normal((BATCH, GOAL))
+    head = StateGoalHead(GOAL)
+    params = head.init(jax.random.key(0), jnp.asarray(state))["params"]
+    params = {**params, "log_std": jnp.asarray(LOG_STD)}
+
+    def loss(heat):
+        found = head.apply({"params": {**params, "heat": heat}}, jnp.asarray(state))
+        return found.negative_log_likelihood(jnp.asarray(goal)).sum()
+
+    kernel, bias = (np.asarray(params["vote"][name]) for name in ("kernel", "bias"))
+    votes = np.einsum("bs,spg->bpg", state, kernel) + bias
+    heat = rng.standard_normal(head.candidates)
+    prior = softmax(heat)
+    likelihood = np.stack([likelihoods(prior, vote, goal[i]) for i, vote in enumerate(votes)])
+    np.testing.assert_allclose(loss(jnp.asarray(heat)), -np.log(likelihood.sum(axis=-1)).sum(), rtol=1e-10)
+    posterior = likelihood / likelihood.sum(axis=-1, keepdims=True)
+    np.testing.assert_allclose(jax.grad(loss)(jnp.asarray(heat)), (prior - posterior).sum(axis=0), rtol=1e-10)
 
 
 def test_votes_are_affine_in_the_position_and_the_weights_follow_the_features(rng):
