@@ -177,7 +177,7 @@ class Cells:
 
         compiled = self._once(
             ("compiled", self._programs(config)),
-            lambda: Trainer.run.lower(trainer, state, repeated, key, every).compile(platform.pixel_options()),
+            lambda: Trainer.run.lower(trainer, state, repeated, key, every).compile(platform.pixel_options(trainer.env.chain)),
         )
         lap("compile")
         best, step = (state.params, 0, -1.0), 0

@@ -30,13 +30,16 @@ class DataConfig:
         tasks: training tasks.
         demos_per_task: demonstrations of each, in different scenes.
         noise: standard deviation of the Gaussian noise on the expert's actions, in units of the action.
-        plan_iterations: most iterations of trajectory optimisation for a demonstration.
+        spare_demos: demonstrations of validation and test tasks beyond those that are shown, in place of failed ones.
+        plan_iterations: most iterations of trajectory optimisation for a demonstration; 0 for the environment's
+            controller instead.
         plan_batch: demonstrations planned at once.
     """
 
     tasks: int = 1500
     demos_per_task: int = 10
     noise: float = 0.01
+    spare_demos: int = 0
     plan_iterations: int = 16
     plan_batch: int = 4096
 
@@ -234,6 +237,58 @@ def _reach_state_cpu() -> Config:
     return config
 
 
+def _push_paper() -> Config:
+    return Config(
+        env=EnvConfig(image_shape=(125, 125)),
+        data=DataConfig(tasks=769, demos_per_task=12, noise=0.1, spare_demos=2, plan_iterations=0),
+        network=NetworkConfig(
+            filters=(16,) * 4,
+            strides=(2,) * 4,
+            kernel=5,
+            soft_argmax=True,
+            fc_layers=(200, 200, 200),
+            fc_norm=False,
+            fc_init_std=0.01,
+            bias_transformation=20,
+            heads=2,
+        ),
+        mil=MILConfig(inner_lr=0.01, inner_clip=10.0, loss_scale=50.0),
+        train=TrainConfig(meta_batch=15),
+        evaluation=EvalConfig(tasks=740, trials=6, baseline_trials=6, batch=185),
+    )
+
+
+def _push_fast() -> Config:
+    config = _push_paper()
+    config.network = NetworkConfig(
+        filters=(16,) * 4,
+        strides=(2, 2, 2, 1),
+        kernel=5,
+        mixed_precision=True,
+        soft_argmax=True,
+        fc_layers=(200, 200, 200),
+        goal_head=True,
+        bias_transformation=20,
+    )
+    config.mil = MILConfig(inner_lr=0.03, learn_inner_lr=True, whiten_actions=True, goal_weight=1.0)
+    config.optimizer = OptimizerConfig(learning_rate=3e-3, warmup=0.05, cosine=True, clip_norm=1.0)
+    config.train = TrainConfig(meta_batch=32, support_frames=4, query_frames=8, redraw=True)
+    return config
+
+
+def _push_cpu() -> Config:
+    config = _push_fast()
+    config.env = EnvConfig(image_shape=(48, 48))
+    config.data.tasks, config.data.demos_per_task = 200, 6
+    config.network.mixed_precision = False
+    config.network.kernel, config.network.strides = 3, (2, 2, 1, 1)
+    config.train = TrainConfig(
+        steps=10_000, meta_batch=8, support_frames=4, query_frames=8, redraw=True, eval_every=2500
+    )
+    config.evaluation = EvalConfig(validation_tasks=25, tasks=74, trials=6, baseline_trials=1, batch=25)
+    return config
+
+
 def _without_pixels(config: Config) -> Config:
     """No convolutions, but all time steps, which cost little now."""
     network = config.network
@@ -245,6 +300,7 @@ def _without_pixels(config: Config) -> Config:
 
 PRESETS: dict[str, dict[str, Callable[[], Config]]] = {
     "reach": {"paper": _reach_paper, "fast": _reach_fast, "cpu": _reach_cpu},
+    "push": {"paper": _push_paper, "fast": _push_fast, "cpu": _push_cpu},
     "reach_state": {"fast": _reach_state_fast, "cpu": _reach_state_cpu},
 }
 """Preset factories by environment and name."""

@@ -108,16 +108,17 @@ def baselines(env: Env, demos: DemoSet, config: EvalConfig, expert: DataConfig, 
     """
     num_trials = min(config.baseline_trials, config.trials)
     scene = trial_scenes(env, demos.task, jax.random.split(key)[0], config.trials)
-    scene = jax.tree.map(lambda x: x[:, :num_trials].reshape(-1, *x.shape[2:]), scene)
+    total = demos.num_tasks * num_trials  # said, as arrays without entries do not tell
+    scene = jax.tree.map(lambda x: x[:, :num_trials].reshape(total, *x.shape[2:]), scene)
     task = jax.tree.map(lambda x: jnp.repeat(x, num_trials, axis=0), demos.task)
-    keys = jax.random.split(jax.random.fold_in(key, 1), demos.num_tasks * num_trials)
+    keys = jax.random.split(jax.random.fold_in(key, 1), total)
 
     # Both experts plan for the task as they believe it to be, and both are judged by the task as it is.
     believed = jax.vmap(env.task_blind)(keys, task), task
     twice = [jax.tree.map(lambda *xs: jnp.concatenate(xs), *pair) for pair in (believed, (scene, scene), (keys, keys))]
     options = Options(iterations=expert.plan_iterations)
     states, _ = map_in_chunks(lambda *chunk: perform(env, *chunk, options, 0.0), tuple(twice), expert.plan_batch)
-    both = jax.tree.map(lambda x: x.reshape(2, -1, *x.shape[1:]), states)
+    both = jax.tree.map(lambda x: x.reshape(2, total, *x.shape[1:]), states)
     task_blind, informed = jax.jit(jax.vmap(jax.vmap(env.success), in_axes=(None, 0)))(task, both).mean(axis=1)
     random = run_trials(env, Random(env.action_size), (), demos, config, key).success[:, :num_trials]
     return {"random": float(random.mean()), "task_blind": float(task_blind), "expert": float(informed)}

@@ -12,6 +12,7 @@ import numpy as np
 from milx import config as config_lib
 from milx import envs, methods
 from milx.checkpoint import Checkpoints
+from milx.goals import goals
 from milx.methods import Method, Spec
 from milx.types import Demo, Observation, Params
 from milx.whitening import Whitening
@@ -24,7 +25,7 @@ def spec_of(env: envs.Env) -> Spec:
     image_to_goal = None if calibration is None else tuple(tuple(row) for row in calibration.tolist())
     image_shape = env.image_shape if env.vision else None
     sizes = image_shape, env.state_size, env.action_size
-    return Spec(*sizes, (low, high), env.goal_indices, image_to_goal, env.object_indices)
+    return Spec(*sizes, (low, high), env.goal_indices, image_to_goal, env.object_indices, env.height_index)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -134,7 +135,9 @@ def check_demo(demo: Demo, spec: Spec) -> Demo:
         index = tuple(outside[0])
         limits = f"at least {low[index[-1]]} and at most {high[index[-1]]}"
         raise ValueError(f"demo.action: got {checked.action[index]} at {index}, expected {limits}")
-    return checked if lead else jax.tree.map(lambda x: x[None], checked)
+    checked = checked if lead else jax.tree.map(lambda x: x[None], checked)
+    goal = jax.vmap(lambda state: goals(state, spec.goal_indices, spec.height_index))(checked.state)
+    return dataclasses.replace(checked, goal=goal)
 
 
 def check_observation(observation: Observation, spec: Spec) -> Observation:

@@ -43,8 +43,8 @@ def split_demos(env: envs.Env, config: Config, split: str) -> DemoSet:
     """The demonstrations of a split as a run uses them, planned or from the cache of earlier runs."""
     num_tasks, num_demos = {
         "train": (config.data.tasks, config.data.demos_per_task),
-        "validation": (config.evaluation.validation_tasks, config.evaluation.shots),
-        "test": (config.evaluation.tasks, config.evaluation.shots),
+        "validation": (config.evaluation.validation_tasks, config.evaluation.shots + config.data.spare_demos),
+        "test": (config.evaluation.tasks, config.evaluation.shots + config.data.spare_demos),
     }[split]
     seed = config.seed if split == "train" else EVALUATION_SEED
     folder = platform.cache_folder() / "demos"
@@ -65,7 +65,14 @@ def check_steps(config: Config) -> None:
 
 
 def initial_state(trainer: Trainer, config: Config, train: DemoSet) -> tuple[TrainState, jax.Array]:
-    """The state before the first meta-update on these demonstrations, and the key of the batches."""
+    """The state before the first meta-update on these demonstrations, and the key of the batches.
+
+    Raises:
+        ValueError: if no task has enough successful demonstrations for support and query.
+    """
+    most, shots = int(train.success.sum(axis=1).max()), config.train.shots
+    if most <= shots:
+        raise ValueError(f"data: at most {most} demonstrations of a task succeed, expected more than {shots}")
     init_key, batch_key = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), 3))
     statistics = whitening.fit(_robot_states(trainer.env, train.states), train.action, config.mil.whiten_actions)
     return trainer.init(init_key, statistics), batch_key
@@ -214,7 +221,7 @@ class Run:
 
         def compile_step() -> Callable[..., Any]:
             lowered = Trainer.run.lower(self.trainer, state, demos, jax.random.key(0), config.train.log_every)
-            return lowered.compile(platform.pixel_options())
+            return lowered.compile(platform.pixel_options(self.env.chain))
 
         thread = ThreadPoolExecutor(max_workers=1)  # tracing holds Python's lock: more would slow the planner's down
         compiled = thread.submit(compile_step)

@@ -2,7 +2,7 @@
 
 Letters used in shapes throughout the project:
     `N` tasks, `K` demonstrations of a task (shots), `T` time steps, `H`, `W` image height and width,
-    `S` size of the robot's state, `A` size of an action, `O` objects.
+    `S` size of the robot's state, `A` size of an action, `G` size of a goal, `O` objects.
 """
 
 import dataclasses
@@ -43,11 +43,13 @@ class Demo:
         image: [T, H, W, 3] uint8, RGB; None where policies see no pixels.
         state: [T, S] float32; None when the demonstration has no states.
         action: [T, A] float32; None when the demonstration has no actions.
+        goal: [T, G] float32, where the robot was heading (`milx.goals`), in the units of the state; None if unknown.
     """
 
     image: Array = None
     state: Array = None
     action: Array = None
+    goal: Array = None
 
 
 @jax.tree_util.register_dataclass

@@ -18,13 +18,14 @@ from milx.whitening import Whitening
 
 
 def random_batch(env: Env, tasks: int, frames: int) -> TaskBatch:
-    """Images, states and actions without meaning."""
+    """Images, states, actions and goals without meaning."""
 
     def demo(key: jax.Array) -> Demo:
         keys = jax.random.split(key, 3)
         image = jax.random.randint(keys[0], (tasks, 1, frames, *env.image_shape, 3), 0, 256).astype(jnp.uint8)
         state = jax.random.normal(keys[1], (tasks, 1, frames, env.state_size))
-        return Demo(image, state, jax.random.uniform(keys[2], (tasks, 1, frames, env.action_size), minval=-1))
+        action = jax.random.uniform(keys[2], (tasks, 1, frames, env.action_size), minval=-1)
+        return Demo(image, state, action, goal=state[..., jnp.array(env.goal_indices)])
 
     return TaskBatch(*(demo(key) for key in jax.random.split(jax.random.key(0))))
 
@@ -53,5 +54,5 @@ def measure_step(config: Config, env: Env) -> tuple[float, float]:
     inputs = trainer.init(jax.random.key(0), unit_whitening(env)), random_demos(env, 64, 4), jax.random.key(1)
     inputs = jax.device_put(inputs, NamedSharding(parallel.mesh(), PartitionSpec()))
     steps = 20 if common.ACCELERATED else 2
-    compiled = Trainer.run.lower(trainer, *inputs, steps).compile(platform.pixel_options())
+    compiled = Trainer.run.lower(trainer, *inputs, steps).compile(platform.pixel_options(env.chain))
     return common.median_ms(compiled, *inputs, repeats=5) / steps, common.gib(compiled)

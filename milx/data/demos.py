@@ -17,6 +17,7 @@ from milx import parallel
 from milx.chunks import map_in_chunks
 from milx.config import DataConfig
 from milx.envs.base import SPLITS, Env, State, Task
+from milx.goals import goals
 from milx.trajopt.expert import perform
 from milx.trajopt.ilqr import Options
 from milx.types import Demo, TaskBatch
@@ -25,7 +26,7 @@ from milx.types import Demo, TaskBatch
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class DemoSet:
-    """D demonstrations of each of N tasks.
+    """D demonstrations of each of N tasks, those that succeed before those that do not.
 
     Attributes:
         task: the tasks, with a leading axis [N].
@@ -70,7 +71,9 @@ def collect(env: Env, key: jax.Array, split: str, num_tasks: int, num_demos: int
     states, action, success = jax.tree.map(
         lambda x: x.reshape(num_tasks, num_demos, *x.shape[1:]), (states, action, success)
     )
-    return DemoSet(tasks, states, action, success)
+    order = jnp.argsort(~success, axis=1)
+    rows = jnp.arange(num_tasks)[:, None]
+    return DemoSet(tasks, *jax.tree.map(lambda x: x[rows, order], (states, action, success)))
 
 
 @functools.partial(jax.jit, static_argnums=(0, 2, 3, 4))
@@ -108,7 +111,9 @@ def render_demo(env: Env, task: Task, states: State, action: jax.Array, index: j
     """
     index = jnp.arange(len(action)) if index is None else index
     seen = jax.vmap(env.observe, in_axes=(None, 0))(task, jax.tree.map(lambda x: x[index], states))
-    return Demo(image=seen.image, state=seen.state, action=action[index])
+    robot = jax.vmap(env.robot_state)(jax.tree.map(lambda x: x[: len(action)], states))
+    goal = goals(robot, env.goal_indices, env.height_index)[index]
+    return Demo(image=seen.image, state=seen.state, action=action[index], goal=goal)
 
 
 def sample_batch(
@@ -120,7 +125,7 @@ def sample_batch(
     query_frames: int | None = None,
     redraw: bool = False,
 ) -> TaskBatch:
-    """Draws tasks and different demonstrations of each, and renders them.
+    """Draws tasks and different demonstrations of each that succeed, and renders them.
 
     Args:
         env: the environment that renders.
@@ -131,11 +136,12 @@ def sample_batch(
         query_frames: time steps drawn from the query demonstration; None for all.
         redraw: show a task in a new appearance of the training split, and each of its demonstrations in a new scene.
     """
+    enough = (demos.success.sum(axis=1) > shots).astype(float)
 
     def sample_task(key: jax.Array) -> TaskBatch:
         task_key, demo_key, support_key, query_key = jax.random.split(key, 4)
-        n = jax.random.randint(task_key, (), 0, demos.num_tasks)
-        chosen = jax.random.choice(demo_key, demos.num_demos, (shots + 1,), replace=False)
+        n = jax.random.choice(task_key, demos.num_tasks, p=enough / enough.sum())
+        chosen = jax.random.choice(demo_key, demos.num_demos, (shots + 1,), replace=False, p=demos.success[n] / 1.0)
         task = jax.tree.map(lambda x: x[n], demos.task)
         if redraw:
             task = env.redraw_appearance(jax.random.fold_in(key, 1), task)

@@ -1,9 +1,10 @@
 """Environments by name."""
 
 from milx.envs.base import SPLITS, Env, State, Task
+from milx.envs.push import Push
 from milx.envs.reach import Reach, ReachState
 
-ENVS: dict[str, type[Env]] = {env.name: env for env in (Reach, ReachState)}
+ENVS: dict[str, type[Env]] = {env.name: env for env in (Reach, ReachState, Push)}
 
 __all__ = ["ENVS", "SPLITS", "Env", "State", "Task", "make"]
 

@@ -63,7 +63,8 @@ class Env(abc.ABC):
         image_shape: (H, W) of the published experiment.
         camera: the MJCF camera that the policy sees through.
         criterion: what counts as success, in words, for result files.
-        goal_indices: entries of the robot's state that tell, at the end of a demonstration, where it went.
+        goal_indices: entries of the robot's state that tell where it is heading (`milx.goals`).
+        height_index: the entry that tells how high its hand is, where it must come down to an object; None otherwise.
         vision: whether the policy sees the image; if not, the state tells it where the objects are.
         object_indices: [O][2] entries of the state with each object's place, where the state tells them.
     """
@@ -75,6 +76,7 @@ class Env(abc.ABC):
     camera: str
     criterion: str
     goal_indices: tuple[int, ...]
+    height_index: int | None = None
     vision: bool = True
     object_indices: tuple[tuple[int, ...], ...] = ()
 
@@ -93,6 +95,14 @@ class Env(abc.ABC):
         return self.mj_model.nu
 
     @property
+    def chain(self) -> int:
+        """Joints in the longest kinematic chain."""
+        model, joints = self.mj_model, [0]
+        for body in range(1, model.nbody):
+            joints.append(joints[model.body_parentid[body]] + model.body_jntnum[body])
+        return int(max(joints))
+
+    @property
     def action_range(self) -> tuple[jax.Array, jax.Array]:
         """The lowest and highest action, [A] each; `step` clips to it."""
         low, high = self.mj_model.actuator_ctrlrange.T
@@ -103,18 +113,21 @@ class Env(abc.ABC):
         """[3, G] from (x, y, 1), x and y in [-1, 1] across and down the image, to the goal; None if not known."""
         return None
 
-    def image_to_plane(self, height: float) -> np.ndarray:
-        """[3, 2] from (x, y, 1) to the x and y (m) of what is seen there at this height: exact from straight above."""
+    def image_to_plane(self, low: tuple[float, float], high: tuple[float, float], height: float) -> np.ndarray:
+        """[3, 2] from (x, y, 1) to the x and y (m) of what is seen there, between `low` and `high` at this height.
+
+        Exact for a camera that looks straight down, else the least squares over that part of the plane.
+        """
         data = mujoco.MjData(self.mj_model)
         mujoco.mj_forward(self.mj_model, data)
         camera = self.mj_model.camera(self.camera).id
+        place = np.stack(np.meshgrid(*np.linspace(low, high, 5).T), axis=-1).reshape(-1, 2)
+        point = np.column_stack([place, np.full(len(place), height)]) - data.cam_xpos[camera]
+        x, y, z = (point @ data.cam_xmat[camera].reshape(3, 3)).T
         tangent = np.tan(np.radians(self.mj_model.cam_fovy[camera]) / 2)
         aspect = self.image_shape[1] / self.image_shape[0]
-        corner = np.array([[x, y, 1] for x in (-1, 1) for y in (-1, 1)])
-        ray = corner * [tangent * aspect, -tangent, -1] @ data.cam_xmat[camera].reshape(3, 3).T
-        origin = data.cam_xpos[camera]
-        seen = origin + ray * ((height - origin[2]) / ray[:, 2:])
-        return np.linalg.lstsq(corner, seen[:, :2], rcond=None)[0]
+        image = np.column_stack([x / aspect, -y, -z * tangent]) / (-z * tangent)[:, None]
+        return np.linalg.lstsq(image, place, rcond=None)[0]
 
     @property
     @abc.abstractmethod
@@ -163,6 +176,14 @@ class Env(abc.ABC):
     @abc.abstractmethod
     def task_blind(self, key: jax.Array, task: Task) -> Task:
         """The task as someone understands it who saw no demonstration: a random candidate is the target."""
+
+    def control(self, task: Task, state: State) -> jax.Array:
+        """[A] a controller that knows the task: it demonstrates where nothing is planned.
+
+        Raises:
+            ValueError: unless overridden.
+        """
+        raise ValueError(f"data.plan_iterations: got 0, expected at least 1: {self.name} has no controller")
 
     def guess(self, task: Task, state: State) -> jax.Array:
         """[T, A] actions with which the planner begins; nothing unless overridden."""

@@ -30,6 +30,8 @@ MASS = (0.2, 1.0)
 """Of an object (kg), drawn uniformly."""
 DAMPING = (0.2, 5.0)
 """Of an object's sliding (N s/m), drawn uniformly."""
+BEHIND = 1.25
+"""The hand comes down about so many times as far from the goal's centre as the object is."""
 NUM_JOINTS = 7
 _START = (0.0, -0.895, 0.0, 2.397, 0.0, 0.069, 0.0)
 _OUT_OF_THE_WAY = (0.0, 0.0, -10.0)
@@ -78,6 +80,7 @@ class Push(Env):
     criterion = f"centre on the goal disc for at least {STEPS_ON_GOAL} of 100 steps"
     state_size = 20
     goal_indices = (14, 15)
+    height_index = 16
 
     def __init__(self, image_shape: tuple[int, int] | None = None):
         super().__init__(_build(), image_shape)
@@ -137,6 +140,11 @@ class Push(Env):
         objects = jnp.concatenate([first, turn], axis=-1).ravel()
         qpos = jnp.concatenate([jnp.array(_START), objects])
         return State(qpos, jnp.zeros_like(qpos), jnp.zeros((0, 3)))
+
+    @property
+    def image_to_goal(self) -> np.ndarray:
+        """The goal head looks for the target, and the hand comes down behind it."""
+        return BEHIND * self.image_to_plane(LOW, HIGH, 0.02)
 
     @functools.partial(jax.jit, static_argnums=0)
     def model_of(self, task: PushTask) -> mjx.Model:

@@ -68,7 +68,7 @@ class Reach(Env):
     @property
     def image_to_goal(self) -> np.ndarray:
         """The goal is the fingertip's place, at last over a cube."""
-        return self.image_to_plane(self._height)
+        return self.image_to_plane((-EXTENT, -EXTENT), (EXTENT, EXTENT), self._height)
 
     def sample_task(self, key: jax.Array, split: str) -> ReachTask:
         """Draws three different colours from the split's grid, and the target among them."""

@@ -24,10 +24,11 @@ class Spec:
         state_size: S.
         action_size: A.
         action_range: lowest and highest entry of each action.
-        goal_indices: entries of the state that tell, at the end of a demonstration, where it went.
+        goal_indices: entries of the state that tell where the robot is heading (`milx.goals`).
         image_to_goal: [3][G] affine map from (x, y, 1), x and y in [-1, 1] across and down the image, to those entries,
             from the camera's calibration; None if that is not known.
         object_indices: [O][2] entries of the state with each object's place, where the state tells them.
+        height_index: entry of the state that tells how high the hand is, where it must come down to an object.
     """
 
     image_shape: tuple[int, int] | None
@@ -37,6 +38,7 @@ class Spec:
     goal_indices: tuple[int, ...]
     image_to_goal: tuple[tuple[float, ...], ...] | None = None
     object_indices: tuple[tuple[int, ...], ...] = ()
+    height_index: int | None = None
 
 
 def _make_mil(config: Config, spec: Spec) -> Method:

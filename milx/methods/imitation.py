@@ -26,7 +26,7 @@ def behavioural_cloning(
         action: [K T, A], the head that is meant.
         demo: demonstrations [K, T, ...].
         whitening: of `demo`.
-        goal_indices: entries of the state at a demonstration's last step that the goal head predicts.
+        goal_indices: entries of the state that the goal head predicts.
 
     Returns:
         The sum, and its parts.
@@ -35,9 +35,10 @@ def behavioural_cloning(
     error = config.loss_scale * (action - whitening.action(shown))
     loss = action_loss = jnp.mean(jnp.square(error))
     metrics = {"action_loss": action_loss}
-    if output.goal is not None:
-        end = whitening.state(demo.state)[:, -1, jnp.array(goal_indices)]
-        goal = jnp.repeat(end, demo.state.shape[1], axis=0)
+    if output.goal is not None and demo.goal is not None:
+        indices = jnp.array(goal_indices)
+        goal = (demo.goal - whitening.state_mean[indices]) / whitening.state_scale[indices]
+        goal = goal.reshape(-1, len(goal_indices))
         metrics["goal_loss"] = output.goal.negative_log_likelihood(goal).mean()
         loss += config.goal_weight * metrics["goal_loss"]
     return loss, metrics

@@ -60,7 +60,7 @@ class MIL(Method):
     Attributes:
         config: inner steps and losses.
         network: the policy network.
-        goal_indices: entries of the state at a demonstration's last step that the goal head predicts.
+        goal_indices: entries of the state that the goal head predicts.
         image_to_goal: [3, G] from (x, y, 1), x and y in [-1, 1] across and down the image, to those entries, to start
             the goal head from; None without one, or if it must learn that by itself.
     """

@@ -1,7 +1,8 @@
 """Experts: plan every scene once by iLQR, then run the plan's feedback with noise on the actions.
 
 The noise drives the arm off the plan and the recorded action is the feedback's answer, before the noise: a
-demonstration so shows how to recover, and its labels are clean (DART, Laskey et al. 2017).
+demonstration so shows how to recover, and its labels are clean (DART, Laskey et al. 2017). Where nothing is planned
+(no iterations) the feedback is the environment's controller.
 """
 
 import functools
@@ -28,23 +29,38 @@ def plan(env: Env, task: Task, state: State, options: Options) -> Plan:
 
 
 def demonstrate(
-    env: Env, task: Task, state: State, expert: Plan, key: jax.Array, noise: float
+    env: Env, task: Task, state: State, expert: Plan | None, key: jax.Array, noise: float
 ) -> tuple[State, jax.Array]:
-    """Runs the plan's feedback from `state` with Gaussian noise of standard deviation `noise` on the actions.
+    """Runs feedback from `state` with Gaussian noise of standard deviation `noise` on the actions.
+
+    Args:
+        env: the environment.
+        task: what is to be done.
+        state: the scene.
+        expert: the plan whose feedback runs; None for the environment's controller.
+        key: draws the noise.
+        noise: in units of the action.
 
     Returns:
         The states, with a leading axis T + 1, and the feedback's noiseless actions [T, A].
     """
     low, high = env.action_range
 
+    def feedback(state: State, planned: tuple | None) -> jax.Array:
+        if planned is None:
+            return env.control(task, state)
+        nominal_state, nominal_action, gain = planned
+        return nominal_action + gain @ (state.vector - nominal_state)
+
     def step(state: State, inputs: tuple) -> tuple[State, tuple[State, jax.Array]]:
-        nominal_state, nominal_action, gain, key = inputs
-        action = jnp.clip(nominal_action + gain @ (state.vector - nominal_state), low, high)
+        planned, key = inputs
+        action = jnp.clip(feedback(state, planned), low, high)
         after = env.step(task, state, action + noise * jax.random.normal(key, action.shape))
         return after, (state, action)
 
     keys = jax.random.split(key, env.horizon)
-    last, (states, actions) = jax.lax.scan(step, state, (expert.states[:-1], expert.actions, expert.gains, keys))
+    planned = None if expert is None else (expert.states[:-1], expert.actions, expert.gains)
+    last, (states, actions) = jax.lax.scan(step, state, (planned, keys))
     return jax.tree.map(lambda xs, x: jnp.concatenate([xs, x[None]]), states, last), actions
 
 
@@ -55,6 +71,7 @@ def perform(
     """Plans and demonstrates a batch: `task`, `state` and `key` have a leading axis; so have the results."""
 
     def one(noise: float, task: Task, state: State, key: jax.Array) -> tuple[State, jax.Array]:
-        return demonstrate(env, task, state, plan(env, task, state, options), key, noise)
+        expert = plan(env, task, state, options) if options.iterations else None
+        return demonstrate(env, task, state, expert, key, noise)
 
     return parallel.split_tasks(jax.vmap(one, in_axes=(None, 0, 0, 0)), shared=1)(noise, task, state, key)

@@ -36,6 +36,7 @@ def random_demos(rng, *shape):
         image=jnp.asarray(rng.integers(0, 256, (*shape, STEPS, *IMAGE_SHAPE, 3), dtype=np.uint8)),
         state=jnp.asarray(rng.standard_normal((*shape, STEPS, STATE))),
         action=jnp.asarray(rng.standard_normal((*shape, STEPS, ACTION))),
+        goal=jnp.asarray(rng.standard_normal((*shape, STEPS, len(GOAL_INDICES)))),
     )
 
 
@@ -226,7 +227,7 @@ def test_closed_form_of_the_clipped_step(constant_case):
     np.testing.assert_allclose(gradient["policy"], expected.mean(axis=0), rtol=1e-11)
 
 
-def test_goal_head_predicts_the_last_state_of_each_demonstration(batch):
+def test_goal_head_learns_the_goal_of_each_time_step(batch):
     network = PolicyNetwork(
         init=CONSTANT.init,
         apply=lambda theta, image, state: CONSTANT.apply(theta, image, state)._replace(
@@ -237,11 +238,16 @@ def test_goal_head_predicts_the_last_state_of_each_demonstration(batch):
     whitening = random_whitening(np.random.default_rng(4))
     demo = jax.tree.map(lambda x: x[0], batch.query)
     loss, metrics = method.imitation_loss(jnp.asarray(THETA), whitening, demo)
-    goals = np.asarray((demo.state - whitening.state_mean) / whitening.state_scale)[:, -1, list(GOAL_INDICES)]
+    indices = np.array(GOAL_INDICES)
+    goals = np.asarray((demo.goal - whitening.state_mean[indices]) / whitening.state_scale[indices])
     square = np.mean(np.sum((np.array([0.5, -2.0]) - goals) ** 2, axis=-1))
     expected = 0.5 * np.exp(-0.6) * square + np.log(2 * np.pi) + 2 * 0.3  # of one Gaussian in the plane
     np.testing.assert_allclose(metrics["goal_loss"], expected, rtol=1e-12)
     np.testing.assert_allclose(loss, metrics["action_loss"] + 0.7 * expected, rtol=1e-12)
+
+    unknown = dataclasses.replace(demo, goal=None)
+    loss, metrics = method.imitation_loss(jnp.asarray(THETA), whitening, unknown)
+    np.testing.assert_allclose(loss, metrics["action_loss"], rtol=1e-12)
 
 
 def test_votes_start_from_the_cameras_calibration_in_whitened_units():

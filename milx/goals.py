@@ -1,0 +1,24 @@
+"""Where the robot was heading at each step of a demonstration, read off its states: what a goal head learns to see."""
+
+import jax
+import jax.numpy as jnp
+
+
+def goals(state: jax.Array, indices: tuple[int, ...], height: int | None) -> jax.Array:
+    """The goal of every time step, [T, G].
+
+    Without a `height` it is where the demonstration ends. With one, it is where the hand first comes down from above
+    the middle of its heights to below, and from then on where it is: at what it handles.
+
+    Args:
+        state: [T, S] of all time steps.
+        indices: G entries of the state that tell where the robot is.
+        height: the entry that tells how high its hand is.
+    """
+    place, time = state[:, jnp.array(indices, int)], jnp.arange(len(state))
+    if height is None:
+        return jnp.broadcast_to(place[-1], place.shape)
+    z = state[:, height]
+    low = z < (z.min() + z.max()) / 2
+    down = jnp.argmax(low & (time > jnp.argmin(low)))
+    return place[jnp.maximum(time, down)]
