@@ -175,9 +175,10 @@ class Cells:
             seconds[name] += now - began
             began = now
 
+        options = platform.pixel_options(trainer.env.chain)
         compiled = self._once(
             ("compiled", self._programs(config)),
-            lambda: Trainer.run.lower(trainer, state, repeated, key, every).compile(platform.pixel_options(trainer.env.chain)),
+            lambda: Trainer.run.lower(trainer, state, repeated, key, every).compile(options),
         )
         lap("compile")
         best, step = (state.params, 0, -1.0), 0

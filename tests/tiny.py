@@ -11,7 +11,7 @@ def tiny_config(seed: int = 0) -> Config:
     """Sizes at which compiling takes far longer than running."""
     config = make_config("reach", preset="cpu", seed=seed)
     config.data.tasks, config.data.demos_per_task = 8, 3
-    config.data.plan_iterations, config.data.plan_batch = 3, 24
+    config.data.plan_iterations, config.data.plan_batch = 8, 24
     config.network.filters, config.network.strides, config.network.fc_layers = (4, 4), (2, 2), (16,)
     config.train.steps, config.train.log_every, config.train.eval_every = 6, 2, 2
     config.train.meta_batch, config.train.support_frames, config.train.query_frames = 2, 3, 3

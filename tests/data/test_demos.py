@@ -206,6 +206,24 @@ def test_support_and_query_are_different_demonstrations_of_one_task(trained, dra
     assert len(pairs) == 6
 
 
+def test_only_successful_demonstrations_are_drawn(trained):
+    """Of the first task one fails, of the second two: its third has no partner, so the task is never drawn."""
+    success = jnp.ones((8, 3), bool).at[0, 1].set(False).at[1, 1:].set(False)
+    demos, env = dataclasses.replace(trained.train, success=success), trained.run.env
+    batch = jax.jit(lambda keys: demos_lib.sample_batch(env, demos, keys, 1, 1, 1))(
+        jax.random.split(jax.random.key(7), 100)
+    )
+    last = np.asarray(jax.jit(jax.vmap(jax.vmap(env.robot_state)))(jax.tree.map(lambda x: x[:, :, -2], demos.states)))
+    for shown in (batch.support, batch.query):
+        gap = np.abs(shown.state[:, 0, 0, None, None] - last).max(axis=-1)
+        drawn = (gap.reshape(100, 24) < 1e-6).sum(axis=0).reshape(8, 3)
+        assert drawn.sum() == 100
+        assert not drawn[~np.asarray(success)].any()
+        assert not drawn[1].any()
+        assert drawn[0, [0, 2]].min() > 0
+        assert drawn[2:].min() > 0
+
+
 def test_a_redrawn_batch_shows_the_same_demonstrations_in_new_colours_and_places(trained):
     env, keys = trained.run.env, jax.random.split(jax.random.key(6), 3)
     batches = [

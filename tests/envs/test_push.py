@@ -15,7 +15,10 @@ from milx.envs.base import State
 from milx.envs.push import NUM_JOINTS, Push
 from milx.envs.shapes import SHAPES, SPLITS
 from milx.envs.shapes.primitives import NUM_CAPSULES, to_geoms
+from milx.goals import goals
 from milx.render.scene import Renderer, to_uint8
+from milx.trajopt.expert import perform
+from milx.trajopt.ilqr import Options
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -97,21 +100,41 @@ def test_an_episode_of_pushing_is_that_of_mujoco(env, task, touched):
     assert np.abs(found.qvel - np.array(velocities)).max() < 0.1
 
 
-def test_the_controller_pushes_most_objects_to_the_goal(env):
-    @jax.jit
-    @jax.vmap
-    def succeeds(key):
-        task = env.sample_task(key, "train")
-        state = env.reset(jax.random.fold_in(key, 1), task)
+@pytest.fixture(scope="module")
+def shown(env):
+    """Tasks, and demonstrations of them by the controller with noise on its actions."""
+    keys = jax.random.split(jax.random.key(8), 32)
+    tasks = jax.vmap(env.sample_task, in_axes=(0, None))(keys, "train")
+    scenes = jax.vmap(env.reset)(jax.random.split(jax.random.key(9), len(keys)), tasks)
+    return tasks, *perform(env, tasks, scenes, keys, Options(iterations=0), 0.1)
 
-        def step(state, _):
-            state = env.step(task, state, env.control(task, state))
-            return state, state
 
-        after = jax.lax.scan(step, state, length=env.horizon)[1]
-        return env.success(task, jax.tree.map(lambda x, xs: jnp.concatenate([x[None], xs]), state, after))
+def test_the_controller_pushes_most_objects_to_the_goal_in_spite_of_noise(env, shown):
+    tasks, states, _ = shown
+    assert jax.jit(jax.vmap(env.success))(tasks, states).mean() > 0.85
 
-    assert succeeds(jax.random.split(jax.random.key(8), 32)).mean() > 0.85
+
+def test_demonstrations_record_the_controllers_answers_before_the_noise(env, shown):
+    tasks, states, action = jax.tree.map(lambda x: x[:3], shown)
+    before = jax.tree.map(lambda x: x[:, :-1], states)
+    answer = jax.jit(jax.vmap(jax.vmap(env.control, in_axes=(None, 0))))(tasks, before)
+    np.testing.assert_allclose(action, answer, atol=1e-9)
+    quiet = jax.jit(jax.vmap(jax.vmap(env.step, in_axes=(None, 0, 0))))(tasks, before, action)
+    moved = np.linalg.norm(quiet.qvel[..., :NUM_JOINTS] - states.qvel[:, 1:, :NUM_JOINTS], axis=-1)
+    assert moved.min() > 1e-4
+
+
+def test_the_goal_of_a_demonstration_lies_behind_its_target_until_it_is_pushed(env, shown):
+    """What the goal head is to see in the image: near the target, farther from the disc than the target is."""
+    tasks, states, _ = shown
+    robot = jax.jit(jax.vmap(jax.vmap(env.robot_state)))(states)
+    goal = jax.vmap(lambda state: goals(state, env.goal_indices, env.height_index))(robot)[:, 0]
+    place = jax.vmap(env.objects)(jax.tree.map(lambda x: x[:, 0], states))[..., :2]
+    rows = np.arange(len(goal))
+    target, other = place[rows, tasks.target], place[rows, 1 - tasks.target]
+    assert np.linalg.norm(goal - target, axis=-1).max() < 0.12
+    assert (np.linalg.norm(goal, axis=-1) > np.linalg.norm(target, axis=-1)).mean() > 0.9
+    assert (np.linalg.norm(goal - target, axis=-1) < np.linalg.norm(goal - other, axis=-1)).mean() > 0.9
 
 
 def test_the_hand_starts_low_enough_for_every_shape(env, task):

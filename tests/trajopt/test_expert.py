@@ -87,3 +87,11 @@ def test_the_arm_is_driven_by_the_recorded_action_plus_noise(env, demonstrations
     # Four standard errors of a standard deviation and of a mean; 2% because a step is not quite affine in the action.
     np.testing.assert_allclose(noise.std(), NOISE, rtol=4 / np.sqrt(2 * noise.size) + 0.02)
     np.testing.assert_allclose(noise.mean(), 0, atol=4 * NOISE / np.sqrt(noise.size))
+
+
+def test_without_a_plan_there_must_be_a_controller(env):
+    keys = jax.random.split(jax.random.key(0), 1)
+    task = jax.vmap(env.sample_task, in_axes=(0, None))(keys, "train")
+    scene = jax.vmap(env.reset)(keys, task)
+    with pytest.raises(ValueError, match=r"data\.plan_iterations: got 0, expected at least 1: reach has no controller"):
+        expert.perform(env, task, scene, keys, Options(iterations=0), 0.0)
