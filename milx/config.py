@@ -10,6 +10,9 @@ import typing
 from collections.abc import Callable
 from typing import Any
 
+GIVEN = ("video+state+action", "video+state", "video")
+"""What a demonstration can show of a new task."""
+
 
 @dataclasses.dataclass
 class EnvConfig:
@@ -63,6 +66,8 @@ class NetworkConfig:
         heads: 1, or 2 for a separate output layer in the inner loss.
         goal_head: predict where the episode ends, from the image, or from the state where the policy sees no pixels,
             and show the prediction to the layers after it (`milx.networks.goal`).
+        learned_loss: MIL's inner loss where demonstrations show no actions (`mil.given`): "linear", or "temporal" with
+            convolutions over time (`milx.networks.learned_loss`); None where they show them.
         context: size of the vector that methods without adaptation keep of a demonstration: units of the LSTM.
         context_frames: time steps of a demonstration that an LSTM reads.
     """
@@ -79,13 +84,14 @@ class NetworkConfig:
     bias_transformation: int = 10
     heads: int = 1
     goal_head: bool = False
+    learned_loss: str | None = None
     context: int = 512
     context_frames: int = 10
 
 
 @dataclasses.dataclass
 class MILConfig:
-    """Meta-imitation learning (paper, Section 4); the last three hold for all methods.
+    """Meta-imitation learning (paper, Section 4); the last four hold for all methods.
 
     Attributes:
         inner_steps: gradient steps of an adaptation.
@@ -96,6 +102,7 @@ class MILConfig:
         loss_scale: m; errors of the actions are multiplied by it before they are squared.
         whiten_actions: let the network predict actions with zero mean and unit variance.
         goal_weight: weight of the goal head's negative log likelihoods.
+        given: what a policy is shown of a new task: one of GIVEN. Queries, in meta-training, show everything.
     """
 
     inner_steps: int = 1
@@ -106,6 +113,7 @@ class MILConfig:
     loss_scale: float = 1.0
     whiten_actions: bool = False
     goal_weight: float = 0.0
+    given: str = "video+state+action"
 
 
 @dataclasses.dataclass

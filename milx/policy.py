@@ -12,6 +12,7 @@ import numpy as np
 from milx import config as config_lib
 from milx import envs, methods
 from milx.checkpoint import Checkpoints
+from milx.config import GIVEN
 from milx.goals import goals
 from milx.methods import Method, Spec
 from milx.types import Demo, Observation, Params
@@ -63,7 +64,7 @@ class Policy:
             ValueError: for a field that is missing, not wanted, or of a wrong shape or type, a value that is not
                 finite, or an action that the environment does not allow.
         """
-        return self._adapt(params, check_demo(demo, self.spec))
+        return self._adapt(params, check_demo(demo, self.spec, self.config.mil.given))
 
     def act(self, task_params: Params, observation: Observation) -> jax.Array:
         """The action [A], in the environment's units, for one observation; jitted.
@@ -111,33 +112,45 @@ def params_like(method: Method, spec: Spec) -> Params:
     return jax.eval_shape(method.init, jax.random.key(0), Whitening(state, state, action, action))
 
 
-def check_demo(demo: Demo, spec: Spec) -> Demo:
-    """Checks demonstrations and gives them their leading axis K.
+def check_demo(demo: Demo, spec: Spec, given: str = GIVEN[0]) -> Demo:
+    """Checks demonstrations, leaves out what is not `given`, adds their goals, and gives them their leading axis K.
 
     Raises:
         ValueError: naming the field, what came and what was expected.
     """
     if not isinstance(demo, Demo):
         raise ValueError(f"demo: got {type(demo).__name__}, expected a milx.Demo")
-    action = _as_array("demo.action", demo.action)
-    lead = action.ndim - 2
-    if lead not in (0, 1) or 0 in action.shape:
-        expected = "[T, A] or [K, T, A] with at least one time step"
-        raise ValueError(f"demo.action: got shape {list(action.shape)}, expected {expected}")
-    shape = action.shape[: lead + 1]
-    checked = Demo(
-        image=_check_image("demo.image", demo.image, shape, spec),
-        state=_check_vector("demo.state", demo.state, (*shape, spec.state_size)),
-        action=_check_vector("demo.action", action, (*shape, spec.action_size)),
-    )
-    low, high = spec.action_range
-    if outside := np.argwhere((checked.action < low) | (checked.action > high)).tolist():
-        index = tuple(outside[0])
-        limits = f"at least {low[index[-1]]} and at most {high[index[-1]]}"
-        raise ValueError(f"demo.action: got {checked.action[index]} at {index}, expected {limits}")
-    checked = checked if lead else jax.tree.map(lambda x: x[None], checked)
+    leading = {"video+state+action": "action", "video+state": "state", "video": "image"}[given]
+    axes = {"action": ("A",), "state": ("S",), "image": ("H", "W", "3")}[leading]
+    first = _as_array(f"demo.{leading}", getattr(demo, leading))
+    lead = first.ndim - len(axes) - 1
+    if lead not in (0, 1) or 0 in first.shape:
+        size = ", ".join(axes)
+        expected = f"[T, {size}] or [K, T, {size}] with at least one time step"
+        raise ValueError(f"demo.{leading}: got shape {list(first.shape)}, expected {expected}")
+    shape = first.shape[: lead + 1]
+    checked = Demo(_check_image("demo.image", demo.image, shape, spec))
+    if given != "video":
+        state = _check_vector("demo.state", demo.state, (*shape, spec.state_size))
+        checked = dataclasses.replace(checked, state=state)
+    if given == "video+state+action":
+        checked = dataclasses.replace(checked, action=_check_action(demo.action, shape, spec))
+    if not lead:
+        checked = jax.tree.map(lambda x: x[None], checked)
+    if checked.state is None:
+        return checked
     goal = jax.vmap(lambda state: goals(state, spec.goal_indices, spec.height_index))(checked.state)
     return dataclasses.replace(checked, goal=goal)
+
+
+def _check_action(value: Any, shape: tuple[int, ...], spec: Spec) -> np.ndarray:
+    action = _check_vector("demo.action", value, (*shape, spec.action_size))
+    low, high = spec.action_range
+    if outside := np.argwhere((action < low) | (action > high)).tolist():
+        index = tuple(outside[0])
+        limits = f"at least {low[index[-1]]} and at most {high[index[-1]]}"
+        raise ValueError(f"demo.action: got {action[index]} at {index}, expected {limits}")
+    return action
 
 
 def check_observation(observation: Observation, spec: Spec) -> Observation:

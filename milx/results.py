@@ -39,7 +39,7 @@ def describe(
         "num_tasks_train": config.data.tasks,
         "num_demos_train": config.data.tasks * config.data.demos_per_task,
         "shots": config.evaluation.shots,
-        "given": "video+state+action" if env.vision else "state+action",
+        "given": config.mil.given if env.vision else config.mil.given.removeprefix("video+"),
         **summary,
         "criterion": env.criterion,
         "baselines": floors,

@@ -85,6 +85,30 @@ def test_act_is_the_method_s(policy, demo, task_params):
     assert np.abs(before - expected).max() > 1e-4, "the demonstration matters"
 
 
+@pytest.mark.parametrize(
+    ("given", "needed", "shape"),
+    [
+        ("video+state", {"image", "state"}, f"[{T}], expected [T, S]"),
+        ("video", {"image"}, f"[{T}], expected [T, H, W, 3]"),
+    ],
+)
+def test_what_a_policy_is_not_given_it_does_not_ask_for(policy, given, needed, shape):
+    demo = good_demo()
+    checked = check_demo(demo, policy.spec, given)
+    for field in ("image", "state", "action"):
+        value = getattr(checked, field)
+        assert (value is not None) == (field in needed)
+        if field in needed:
+            np.testing.assert_array_equal(value, getattr(demo, field)[None])
+            with pytest.raises(ValueError, match=f"demo.{field}: missing"):
+                check_demo(dataclasses.replace(demo, **{field: None}), policy.spec, given)
+    if "state" in needed:
+        np.testing.assert_array_equal(checked.goal, np.tile(demo.state[-1, [4, 5]], (1, T, 1)))
+    first = "state" if "state" in needed else "image"
+    with pytest.raises(ValueError, match=re.escape(f"demo.{first}: got shape {shape}")):
+        check_demo(dataclasses.replace(demo, **{first: np.zeros(T, np.float32)}), policy.spec, given)
+
+
 BAD_DEMOS = {
     "no action": (lambda d: {"action": None}, "demo.action: missing, expected an array"),
     "no image": (lambda d: {"image": None}, "demo.image: missing, expected an array"),

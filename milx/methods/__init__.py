@@ -4,12 +4,13 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
-from milx.config import Config
+from milx.config import GIVEN, Config
 from milx.methods.base import Method
 from milx.methods.context import ContextPolicy
 from milx.methods.maml import MIL
 from milx.networks.attention import AttentiveActor, ObjectTokens
 from milx.networks.context import Actor, LastFrame, Recurrent, make_context_network
+from milx.networks.learned_loss import KINDS
 from milx.networks.policy import make_policy
 
 __all__ = ["METHODS", "Method", "Spec", "make"]
@@ -88,8 +89,23 @@ def make(config: Config, spec: Spec) -> Method:
 
     Raises:
         ValueError: for a name that does not exist (the message lists those that do), a method that needs to be told
-            where the objects are and is not, or a goal head where the policy sees no pixels.
+            where the objects are and is not, or demonstrations that show too little for their use.
     """
     if config.method_name not in METHODS:
         raise ValueError(f"method: got {config.method_name!r}, expected one of {', '.join(METHODS)}")
+    _check_given(config, spec)
     return METHODS[config.method_name](config, spec)
+
+
+def _check_given(config: Config, spec: Spec) -> None:
+    """Raises ValueError where what demonstrations show does not fit the policy or its inner loss."""
+    given, learned = config.mil.given, config.network.learned_loss
+    if given not in GIVEN:
+        raise ValueError(f"mil.given: got {given!r}, expected one of {', '.join(GIVEN)}")
+    if given == "video" and spec.image_shape is None:
+        raise ValueError("mil.given: got 'video', expected the state, too: this policy sees no pixels")
+    if learned not in (None, *KINDS):
+        raise ValueError(f"network.learned_loss: got {learned!r}, expected None or one of {', '.join(KINDS)}")
+    if config.method_name == "mil" and (learned is None) != (given == GIVEN[0]):
+        expected = "None: the actions are shown" if learned else f"one of {', '.join(KINDS)}: no actions are shown"
+        raise ValueError(f"network.learned_loss: got {learned!r} with mil.given={given!r}, expected {expected}")

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from milx.config import MILConfig
 from milx.methods.base import Method
-from milx.methods.imitation import behavioural_cloning, calibrate_goal_head
+from milx.methods.imitation import behavioural_cloning, calibrate_goal_head, shown
 from milx.networks.context import ContextNetwork
 from milx.types import Demo, Memory, Observation, Params, TaskBatch
 from milx.whitening import Whitening
@@ -41,6 +41,7 @@ class ContextPolicy(Method):
     def adapt(self, params: Params, demo: Demo) -> Params:
         """Encodes demonstrations [K, T, ...]."""
         whitening = jax.lax.stop_gradient(params["whitening"])
+        demo = shown(demo, self.config.given, whitening)
 
         def encode(image: jax.Array | None, state: jax.Array, action: jax.Array) -> Any:
             return self.network.encode(params, image, whitening.state(state), whitening.action(action))

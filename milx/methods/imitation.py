@@ -1,13 +1,27 @@
-"""What methods share that imitate actions: the loss, and a goal head's start from the camera's calibration."""
+"""What methods share that imitate: what they are shown, the loss, a goal head's start from the camera's calibration."""
+
+import dataclasses
 
 import jax
 import jax.numpy as jnp
 
-from milx.config import MILConfig
-from milx.networks.goal import calibrate
+from milx.config import GIVEN, MILConfig
+from milx.networks.goal import Goal, calibrate
 from milx.networks.policy import PolicyOutput
 from milx.types import Demo, Params
 from milx.whitening import Whitening
+
+
+def shown(demo: Demo, given: str, whitening: Whitening) -> Demo:
+    """Demonstrations [K, T, ...] without what is not `given` (`MILConfig.given`): their mean stands in its place."""
+    if given == GIVEN[0]:
+        return demo
+    shape = (demo.state if demo.image is None else demo.image).shape[:2]
+    action = jnp.broadcast_to(whitening.action_mean, (*shape, *whitening.action_mean.shape))
+    if given == GIVEN[1]:
+        return dataclasses.replace(demo, action=action)
+    state = jnp.broadcast_to(whitening.state_mean, (*shape, *whitening.state_mean.shape))
+    return dataclasses.replace(demo, state=state, action=action, goal=None)
 
 
 def behavioural_cloning(
@@ -36,12 +50,16 @@ def behavioural_cloning(
     loss = action_loss = jnp.mean(jnp.square(error))
     metrics = {"action_loss": action_loss}
     if output.goal is not None and demo.goal is not None:
-        indices = jnp.array(goal_indices)
-        goal = (demo.goal - whitening.state_mean[indices]) / whitening.state_scale[indices]
-        goal = goal.reshape(-1, len(goal_indices))
-        metrics["goal_loss"] = output.goal.negative_log_likelihood(goal).mean()
+        metrics["goal_loss"] = goal_loss(output.goal, demo.goal, whitening, goal_indices)
         loss += config.goal_weight * metrics["goal_loss"]
     return loss, metrics
+
+
+def goal_loss(predicted: Goal, goal: jax.Array, whitening: Whitening, goal_indices: tuple[int, ...]) -> jax.Array:
+    """The mean negative log likelihood of goals [K, T, G], predicted for all time steps one after the other."""
+    indices = jnp.array(goal_indices)
+    white = (goal - whitening.state_mean[indices]) / whitening.state_scale[indices]
+    return predicted.negative_log_likelihood(white.reshape(-1, len(goal_indices))).mean()
 
 
 def calibrate_goal_head(

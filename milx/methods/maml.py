@@ -5,8 +5,9 @@ For a task with demonstrations d (support) and d' (query) of the same goal in di
     theta' = theta - alpha * clip(grad_theta L(theta, d))        the inner step, eq. 1
     minimise over theta:  sum over tasks of L(theta', d')        the meta-objective, eq. 3
 
-with the behavioural cloning loss L(theta, d) = mean over t of |m (a_t - pi_theta(o_t))|^2, eq. 2. `jax.grad` goes
-through the inner step, `vmap` over the tasks.
+with the behavioural cloning loss L(theta, d) = mean over t of |m (a_t - pi_theta(o_t))|^2, eq. 2. Where d shows no
+actions the inner step descends a learned loss instead, whose parameters are part of theta. `jax.grad` goes through the
+inner step, `vmap` over the tasks.
 """
 
 import dataclasses
@@ -19,8 +20,8 @@ import jax.numpy as jnp
 
 from milx.config import MILConfig
 from milx.methods.base import Method
-from milx.methods.imitation import behavioural_cloning, calibrate_goal_head
-from milx.networks.policy import PolicyNetwork
+from milx.methods.imitation import behavioural_cloning, calibrate_goal_head, goal_loss, shown
+from milx.networks.policy import PolicyNetwork, PolicyOutput
 from milx.types import Demo, Memory, Observation, Params, TaskBatch
 from milx.whitening import Whitening
 
@@ -81,7 +82,7 @@ class MIL(Method):
 
     def adapt(self, params: Params, demo: Demo) -> Params:
         """Takes the inner gradient steps (eq. 1) on demonstrations [K, T, ...]: their gradients are averaged."""
-        theta = params["policy"]
+        theta, demo = params["policy"], shown(demo, self.config.given, params["whitening"])
         rates = jax.tree.map(lambda _: self.config.inner_lr, theta)
         if self.config.learn_inner_lr:
             rates = jax.tree.map(lambda s: self.config.inner_lr * jnp.exp(s), params["inner_log_lr"])
@@ -110,7 +111,18 @@ class MIL(Method):
         return whitening.unwhiten_action(output.action[0]), memory
 
     def _inner_loss(self, theta: Params, whitening: Whitening, demo: Demo) -> jax.Array:
-        return self.imitation_loss(theta, whitening, demo, inner=True)[0]
+        if self.network.learned_loss is None:
+            return self.imitation_loss(theta, whitening, demo, inner=True)[0]
+        output = self._apply(theta, whitening, demo)
+        loss = self.network.learned_loss(theta, output.features.reshape(*demo.state.shape[:2], -1)).mean()
+        if output.goal is not None and demo.goal is not None:
+            loss += self.config.goal_weight * goal_loss(output.goal, demo.goal, whitening, self.goal_indices)
+        return loss
+
+    def _apply(self, theta: Params, whitening: Whitening, demo: Demo) -> PolicyOutput:
+        """What the network says of all time steps of demonstrations [K, T, ...], one after the other."""
+        flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), demo)
+        return self.network.apply(theta, flat.image, whitening.state(flat.state))
 
     def imitation_loss(
         self, theta: Params, whitening: Whitening, demo: Demo, inner: bool = False
@@ -120,7 +132,6 @@ class MIL(Method):
         `inner` selects the head of the inner loss. Returns the sum and its parts.
         """
         whitening = jax.lax.stop_gradient(whitening)
-        flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), demo)
-        output = self.network.apply(theta, flat.image, whitening.state(flat.state))
+        output = self._apply(theta, whitening, demo)
         action = output.inner_action if inner else output.action
         return behavioural_cloning(self.config, output, action, demo, whitening, self.goal_indices)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from milx.config import NetworkConfig
 from milx.networks.goal import Goal, GoalHead, StateGoalHead
 from milx.networks.layers import ConvBlock, Dense, SpatialSoftArgmax
+from milx.networks.learned_loss import LearnedLoss
 from milx.types import Params
 
 
@@ -20,11 +21,13 @@ class PolicyOutput(NamedTuple):
         action: [B, A] of the head that acts, in the network's units.
         inner_action: [B, A] of the head that the inner loss sees; the same head if there is only one.
         goal: where the episode will end; None without a goal head.
+        features: [B, F] what the last layer sees.
     """
 
     action: jax.Array
     inner_action: jax.Array
     goal: Goal | None
+    features: jax.Array
 
 
 class PolicyNetwork(NamedTuple):
@@ -33,10 +36,12 @@ class PolicyNetwork(NamedTuple):
     Attributes:
         init: key -> params.
         apply: (params, image [B, H, W, 3] uint8 or None, whitened state [B, S]) -> PolicyOutput.
+        learned_loss: (params, features [K, T, F]) -> [K], the loss of demonstrations without actions; None without one.
     """
 
     init: Callable[[jax.Array], Params]
     apply: Callable[[Params, jax.Array | None, jax.Array], PolicyOutput]
+    learned_loss: Callable[[Params, jax.Array], jax.Array] | None = None
 
 
 class ConvStack(nn.Module):
@@ -93,7 +98,7 @@ class Controller(nn.Module):
         for size in config.fc_layers:
             x = Dense(size, hidden=True, norm=config.fc_norm, init_std=config.fc_init_std)(x)
         heads = [Dense(self.action_size, init_std=config.fc_init_std)(x) for _ in range(config.heads)]
-        return PolicyOutput(action=heads[-1], inner_action=heads[0], goal=goal)
+        return PolicyOutput(action=heads[-1], inner_action=heads[0], goal=goal, features=x)
 
 
 class _Policy(nn.Module):
@@ -127,12 +132,23 @@ def make_policy(
     module = _Policy(config, action_size, goal_size)
     image = None if image_shape is None else jnp.zeros((1, *image_shape, 3), jnp.uint8)
 
+    loss = LearnedLoss(config.learned_loss or "linear")
+
     def init(key: jax.Array) -> Params:
-        return module.init(key, image, jnp.zeros((1, state_size)))["params"]
+        output, variables = module.init_with_output(key, image, jnp.zeros((1, state_size)))
+        if config.learned_loss is None:
+            return variables["params"]
+        start = loss.init(jax.random.fold_in(key, 1), output.features[None])
+        return {**variables["params"], "learned_loss": start["params"]}
 
     def apply(params: Params, image: jax.Array | None, state: jax.Array) -> PolicyOutput:
         output = module.apply({"params": params}, image, state)
         assert isinstance(output, PolicyOutput)
         return output
 
-    return PolicyNetwork(init, apply)
+    def learned_loss(params: Params, features: jax.Array) -> jax.Array:
+        value = loss.apply({"params": params["learned_loss"]}, features)
+        assert isinstance(value, jax.Array)
+        return value
+
+    return PolicyNetwork(init, apply, None if config.learned_loss is None else learned_loss)

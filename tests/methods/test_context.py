@@ -122,6 +122,20 @@ def test_several_demonstrations_give_the_mean_of_their_actions(name, vision):
     np.testing.assert_allclose(act(demos), np.mean(each, axis=0), atol=1e-6)
 
 
+@pytest.mark.parametrize(("given", "unseen"), [("video+state", ("action",)), ("video", ("action", "state"))])
+@pytest.mark.parametrize("name", ["contextual", "lstm"])
+def test_what_is_not_given_of_a_demonstration_does_not_matter(name, given, unseen):
+    method, params = build(name, True)
+    method = dataclasses.replace(method, config=dataclasses.replace(method.config, given=given))
+    demo, other = random_demos(np.random.default_rng(4), True, 1), random_demos(np.random.default_rng(5), True, 1)
+    encode = jax.jit(lambda demo: method.adapt(params, demo)["context"])
+    context, seen = encode(demo), {"image", "state"} if name == "contextual" else {"image", "state", "action"}
+    for field in ("image", "state", "action"):
+        change = jnp.abs(encode(dataclasses.replace(demo, **{field: getattr(other, field)})) - context).max()
+        assert (change > 1e-5) == (field in seen - set(unseen)), field
+    np.testing.assert_array_equal(encode(dataclasses.replace(demo, **dict.fromkeys(unseen))), context)
+
+
 def test_contextual_policies_see_the_last_frame_only_and_recurrent_ones_all():
     demo = random_demos(np.random.default_rng(2), True, 1)
     for name, frames_seen in (("contextual", [STEPS - 1]), ("lstm", list(range(STEPS)))):
@@ -160,4 +174,28 @@ def test_attention_to_objects_that_nobody_tells_of_is_refused():
     spec = methods.Spec(None, STATE, ACTION, ((-1.0,) * ACTION, (1.0,) * ACTION), goal_indices=(1,))
     config = Config(method_name="lstm_attention", network=NetworkConfig(filters=(), strides=()))
     with pytest.raises(ValueError, match="method: got 'lstm_attention', expected another: the state does not tell"):
+        methods.make(config, spec)
+
+
+@pytest.mark.parametrize(
+    ("vision", "given", "learned", "message"),
+    [
+        (True, "video+actions", None, r"mil\.given: got 'video\+actions', expected one of video\+state\+action"),
+        (False, "video", "linear", r"mil\.given: got 'video', expected the state, too: this policy sees no pixels"),
+        (True, "video", "cubic", r"network\.learned_loss: got 'cubic', expected None or one of linear, temporal"),
+        (True, "video", None, r"network\.learned_loss: got None with mil\.given='video', expected one of linear, temp"),
+        (
+            True,
+            "video+state+action",
+            "linear",
+            r"network\.learned_loss: got 'linear' .* expected None: the actions",
+        ),
+    ],
+)
+def test_demonstrations_that_show_too_little_are_refused(vision, given, learned, message):
+    sizes = (STATE, ACTION, ((-1.0,) * ACTION, (1.0,) * ACTION))
+    spec = methods.Spec((32, 40) if vision else None, *sizes, goal_indices=(1,))
+    config = Config(network=NetworkConfig(learned_loss=learned))
+    config.mil.given = given
+    with pytest.raises(ValueError, match=message):
         methods.make(config, spec)

@@ -93,6 +93,11 @@ VARIANTS = {
         {"heads": 2, "goal_head": True, "soft_argmax": True},
         {"inner_steps": 2, "learn_inner_lr": True, "goal_weight": 0.7},
     ),
+    "learned loss of states": (
+        {"learned_loss": "linear", "goal_head": True},
+        {"given": "video+state", "goal_weight": 0.7},
+    ),
+    "learned loss over time, two steps": ({"learned_loss": "temporal"}, {"given": "video", "inner_steps": 2}),
 }
 
 
@@ -159,7 +164,9 @@ def test_no_gradient_reaches_the_whitening_and_adam_leaves_it(batch):
 
 CONSTANT = PolicyNetwork(
     init=lambda key: jnp.zeros(ACTION),
-    apply=lambda theta, image, state: PolicyOutput(*[jnp.broadcast_to(theta, (len(state), ACTION))] * 2, goal=None),
+    apply=lambda theta, image, state: PolicyOutput(
+        *[jnp.broadcast_to(theta, (len(state), ACTION))] * 2, goal=None, features=state
+    ),
 )
 THETA = np.array([0.4, -1.3])
 ALPHA, M = 0.1, 1.7
@@ -334,6 +341,26 @@ def test_several_demonstrations_give_the_average_of_their_steps():
         for k in range(3)
     ]
     assert_trees_close(together, jax.tree.map(lambda *x: sum(x) / 3, *steps))
+
+
+NOT_SEEN = {"video+state": ("action",), "video": ("action", "state", "goal")}
+
+
+@pytest.mark.parametrize("given", NOT_SEEN)
+def test_what_is_not_given_of_a_demonstration_does_not_matter(batch, given):
+    """Nor need it be there; all else matters, in the inner step of a learned loss as in a context."""
+    method, params = build({"learned_loss": "linear", "goal_head": True}, given=given, goal_weight=0.7)
+    demo, other = (jax.tree.map(lambda x, n=n: x[n], batch.support) for n in range(2))
+    adapt = jax.jit(method.adapt)
+    adapted = adapt(params, demo)
+    for field in ("image", "state", "action", "goal"):
+        change = difference(adapt(params, dataclasses.replace(demo, **{field: getattr(other, field)})), adapted)
+        assert (float(optax.tree.norm(change["policy"])) > 1e-4) == (field not in NOT_SEEN[given]), field
+    without = dataclasses.replace(demo, **dict.fromkeys(NOT_SEEN[given]))
+    assert_trees_close(adapt(params, without)["policy"], adapted["policy"])
+    step = difference(adapted, params)["policy"]
+    assert float(optax.tree.norm(step["controller"]["Dense_1"])) == 0, "the actions' layer"
+    assert float(optax.tree.norm(step["vision"])) > 1e-4
 
 
 def test_with_two_heads_the_inner_step_leaves_the_head_that_acts(batch):
