@@ -32,6 +32,7 @@ _OUT = flags.DEFINE_string("out", str(_HERE / "results" / "ablations"), "Folder 
 _PRESET = flags.DEFINE_string("preset", "fast", "Hyperparameters of all that is not changed.")
 _STEPS = flags.DEFINE_integer("steps", cells.STEPS["reach"], "Meta-updates of each.")
 _SEEDS = flags.DEFINE_integer("seeds", 2, "Seeds of each.")
+_CHANGED = flags.DEFINE_multi_enum("changed", list(ABLATIONS), list(ABLATIONS), "Which of them; default all.")
 
 
 def configure(changes: dict[str, Any], seed: int) -> Config:
@@ -47,12 +48,12 @@ def main(_: list[str]) -> None:
     folder = pathlib.Path(_OUT.value)
     runner = cells.Cells(folder, configure({}, seed=0).data.tasks)
     for seed in range(_SEEDS.value):
-        for name, changes in ABLATIONS.items():
-            runner.run(f"{name.replace(' ', '-')}-{seed}", configure(changes, seed))
+        for name in _CHANGED.value:
+            runner.run(f"{name.replace(' ', '-')}-{seed}", configure(ABLATIONS[name], seed))
     results = cells.read(folder)
     print("| changed | " + " | ".join(f"seed {seed}" for seed in range(_SEEDS.value)) + " | training |")
     print("|---|" + "---|" * (_SEEDS.value + 1))
-    for name in ABLATIONS:
+    for name in _CHANGED.value:
         runs = [results[f"{name.replace(' ', '-')}-{seed}"] for seed in range(_SEEDS.value)]
         shown = [f"{run['success']:.1%} ({run['wilson95'][0]:.1%} to {run['wilson95'][1]:.1%})" for run in runs]
         print(f"| {name} | {' | '.join(shown)} | {runs[0]['wall_clock_s']['train']:.0f} s |")
