@@ -130,7 +130,7 @@ class Cells:
         trained = self.train(name, config)
         clock.append(time.perf_counter())
         trials = evaluator.run_trials(env, trainer.method, trained.params, test, evaluation, trial_key("test"))
-        summary = evaluator.summary(trials.success)
+        summary = evaluator.summary(trials)
         clock.append(time.perf_counter())
         demos_s, _, evaluate_s = (later - earlier for earlier, later in itertools.pairwise(clock))
         seconds = {"demos": demos_s, **trained.seconds, "evaluate": trained.seconds["evaluate"] + evaluate_s}

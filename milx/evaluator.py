@@ -45,10 +45,12 @@ class Trials(NamedTuple):
 
     Attributes:
         success: [N, trials] bool.
+        other: the same by the environment's other criteria.
         states: visited states, with leading axes [N, trials, T + 1].
     """
 
     success: jax.Array
+    other: dict[str, jax.Array]
     states: State
 
 
@@ -64,7 +66,7 @@ def _run_batch(
 
         def trial(scene: State, key: jax.Array) -> Trials:
             visited, _ = rollout(env, method, task_params, task, scene, key)
-            return Trials(env.success(task, visited), visited)
+            return Trials(env.success(task, visited), env.other_criteria(task, visited), visited)
 
         return jax.vmap(trial)(scene, key)
 
@@ -133,7 +135,16 @@ def film(camera: Env, task: Task, states: State) -> jax.Array:
     return jax.vmap(jax.vmap(camera.render, in_axes=(None, 0)))(task, states)
 
 
-def summary(success: jax.Array) -> dict[str, Any]:
-    """Trials, success rate and its interval from [N, trials] successes."""
+def summary(trials: Trials) -> dict[str, Any]:
+    """Number of trials, success rate and its interval; the same by other criteria, if there are."""
+    others = {name: _rate(success) for name, success in trials.other.items()}
+    return {
+        "trials": int(trials.success.size),
+        **_rate(trials.success),
+        **({"other_criteria": others} if others else {}),
+    }
+
+
+def _rate(success: jax.Array) -> dict[str, Any]:
     successes, trials = int(success.sum()), int(success.size)
-    return {"trials": trials, "success": successes / trials, "wilson95": list(wilson_interval(successes, trials))}
+    return {"success": successes / trials, "wilson95": list(wilson_interval(successes, trials))}

@@ -176,7 +176,7 @@ class Run:
         result = results.describe(
             self.config,
             self.env,
-            evaluator.summary(trials.success),
+            evaluator.summary(trials),
             floors,
             self._elapsed(),
             step,

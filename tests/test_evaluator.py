@@ -39,9 +39,10 @@ def test_wilson_interval_against_scipy(trials):
 
 def test_summary_counts_trials():
     table = jnp.array([[True, False, True], [False, False, True]])
-    found = evaluator.summary(table)
+    found = evaluator.summary(evaluator.Trials(table, {"nearly": ~table | table}, ()))
     assert (found["trials"], found["success"]) == (6, 0.5)
     assert found["wilson95"] == list(evaluator.wilson_interval(3, 6))
+    assert found["other_criteria"]["nearly"] == {"success": 1.0, "wilson95": list(evaluator.wilson_interval(6, 6))}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -17,6 +17,7 @@ import numpy as np
 from mujoco import mjx
 
 from milx.render.scene import Renderer
+from milx.render.textures import Textures
 from milx.types import Observation
 
 Task = Any
@@ -161,6 +162,10 @@ class Env(abc.ABC):
     def colors(self, task: Task) -> jax.Array:
         """[G, 4] RGBA of every geom in this task, in [0, 1]."""
 
+    def textures(self, task: Task, data: mjx.Data) -> Textures | None:
+        """[G] of every geom, with frames that take the world's; none unless overridden."""
+        return None
+
     @abc.abstractmethod
     def running_residual(self, task: Task, state: State, action: jax.Array, t: jax.Array) -> jax.Array:
         """[R] the running cost's residual at step t: the expert minimises half its square."""
@@ -172,6 +177,10 @@ class Env(abc.ABC):
     @abc.abstractmethod
     def success(self, task: Task, states: State) -> jax.Array:
         """Whether an episode succeeded. `states` has a leading axis T + 1; returns a bool scalar."""
+
+    def other_criteria(self, task: Task, states: State) -> dict[str, jax.Array]:
+        """Success by other measures, by what they ask for; reported beside, none unless overridden."""
+        return {}
 
     @abc.abstractmethod
     def task_blind(self, key: jax.Array, task: Task) -> Task:
@@ -226,7 +235,12 @@ class Env(abc.ABC):
         model = self.model_of(task)
         data = mjx.kinematics(model, self.data(state))
         data = mjx.camlight(model, mjx.com_pos(model, data))
-        scene = dataclasses.replace(self.renderer.scene(data), geom_size=model.geom_size, geom_rgba=self.colors(task))
+        scene = dataclasses.replace(
+            self.renderer.scene(data),
+            geom_size=model.geom_size,
+            geom_rgba=self.colors(task),
+            texture=self.textures(task, data),
+        )
         return self.renderer.pixels(scene)
 
 

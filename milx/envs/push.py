@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,9 +14,13 @@ from milx.envs import push_controller
 from milx.envs.base import ASSETS, Env, State, check_split
 from milx.envs.shapes import SHAPES, SPLITS
 from milx.envs.shapes.primitives import NUM_CAPSULES, SLOTS, Geoms, to_geoms
+from milx.render import textures
+from milx.render.textures import Textures
 
 GOAL_RADIUS = 0.08
 """The red disc's (m); its centre is at x = y = 0."""
+NEAR_GOAL = 0.13
+"""The paper's released code counts steps in which the object is this close to the goal (m)."""
 STEPS_ON_GOAL = 10
 """So many of the episode's steps the object must be on the disc."""
 LOW, HIGH = (-0.3, -0.2), (0.0, 0.2)
@@ -54,6 +59,7 @@ class PushTask:
         mass: [2] kg.
         damping: [2] N s/m of viscous friction when it slides; friction against turning follows from its outline.
         color: [2, 3] RGB in [0, 1].
+        texture: [2], with frames that take the object's.
     """
 
     target: jax.Array
@@ -62,6 +68,7 @@ class PushTask:
     mass: jax.Array
     damping: jax.Array
     color: jax.Array
+    texture: Textures
 
 
 class Push(Env):
@@ -95,7 +102,7 @@ class Push(Env):
         self._shapes = jax.tree.map(lambda *x: jnp.asarray(np.array(x)), *shapes)
 
     def sample_task(self, key: jax.Array, split: str) -> PushTask:
-        """Draws two different shapes of the split, their sizes, masses, friction and colours, and the target.
+        """Draws two different shapes of the split, their sizes, masses, friction and looks, and the target.
 
         Raises:
             ValueError: for a split that does not exist.
@@ -103,7 +110,7 @@ class Push(Env):
         check_split(split)
         names = list(SHAPES)
         indices = jnp.array([names.index(name) for name in SPLITS[split]])
-        shape_key, target_key, size_key, mass_key, damping_key, color_key = jax.random.split(key, 6)
+        shape_key, target_key, size_key, mass_key, damping_key, look_key = jax.random.split(key, 6)
         draw = lambda key, limits: jax.random.uniform(key, (2,), minval=limits[0], maxval=limits[1])  # noqa: E731
         return PushTask(
             target=jax.random.randint(target_key, (), 0, 2),
@@ -111,12 +118,12 @@ class Push(Env):
             size=draw(size_key, SIZE),
             mass=draw(mass_key, MASS),
             damping=draw(damping_key, DAMPING),
-            color=jax.random.uniform(color_key, (2, 3)),
+            **_draw_looks(look_key, split),
         )
 
     def redraw_appearance(self, key: jax.Array, task: PushTask) -> PushTask:
-        """The same objects in other colours."""
-        return dataclasses.replace(task, color=jax.random.uniform(key, (2, 3)))
+        """The same objects in other colours and textures."""
+        return dataclasses.replace(task, **_draw_looks(key, "train"))
 
     def redraw_scene(self, key: jax.Array, task: PushTask, states: State) -> State:
         """The same states: both objects may have been touched."""
@@ -194,6 +201,15 @@ class Push(Env):
         color = jnp.broadcast_to(task.color[:, None], (*seen.shape, 3))
         return self._rgba.at[self._geom].set(jnp.concatenate([color, seen[..., None]], axis=-1))
 
+    def textures(self, task: PushTask, data: mjx.Data) -> Textures:
+        """[G] the objects' textures; all else is plain."""
+        geoms, num_geoms = self._geom, self.mj_model.ngeom
+        body = task.texture.frame, data.xpos[self._body], data.xmat[self._body]
+        return jax.tree.map(
+            lambda x: jnp.zeros((num_geoms, *x.shape[1:]), x.dtype).at[geoms].set(x[:, None]),
+            task.texture._replace(frame=textures.in_world(*body)),
+        )
+
     def guess(self, task: PushTask, state: State) -> jax.Array:
         """[T, 7] what `push_controller` does from here."""
 
@@ -240,9 +256,21 @@ class Push(Env):
         """Whether the target's centre was on the disc for at least STEPS_ON_GOAL steps (paper, Section 6.2)."""
         return self.steps_near_goal(task, states, GOAL_RADIUS) >= STEPS_ON_GOAL
 
+    def other_criteria(self, task: PushTask, states: State) -> dict[str, jax.Array]:
+        """That of the paper's released code."""
+        near = self.steps_near_goal(task, states, NEAR_GOAL)
+        return {f"within {NEAR_GOAL} m of the goal for at least {STEPS_ON_GOAL} of 100 steps": near >= STEPS_ON_GOAL}
+
     def task_blind(self, key: jax.Array, task: PushTask) -> PushTask:
         """The task with a random object as the target."""
         return dataclasses.replace(task, target=jax.random.randint(key, (), 0, 2))
+
+
+def _draw_looks(key: jax.Array, split: str) -> dict[str, Any]:
+    """Colours and textures of two objects."""
+    color_key, texture_key = jax.random.split(key)
+    texture = jax.vmap(functools.partial(textures.draw, split=split))(jax.random.split(texture_key))
+    return {"color": jax.random.uniform(color_key, (2, 3)), "texture": texture}
 
 
 def _build() -> mujoco.MjModel:

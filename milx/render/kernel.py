@@ -14,15 +14,16 @@ import numpy as np
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton
 
-from milx.render import raycast, shade
+from milx.render import raycast, shade, textures
 from milx.render.raycast import Kind
+from milx.render.textures import Textures
 
 _TILE = 16  # pixels, in both directions
 _WARPS = 4
 _SLACK = 1.001  # bounding balls are blown up by this, so that rounding never hides a geom
 
 # Columns of the table of geoms.
-_AFFINE, _STRETCH, _BALL, _KIND, _RGB, _MATERIAL = 0, 12, 13, 17, 18, 21
+_AFFINE, _STRETCH, _BALL, _KIND, _RGB, _MATERIAL, _FAMILY, _SECOND, _FRAME = 0, 12, 13, 17, 18, 21, 24, 25, 28
 # Columns of the table of lights: from and to of the vectors, then the two scalars.
 _LIGHT = ((0, 3), (3, 6), (6, 9), (9, 12), (12, 16), (16, 19))
 _CUTOFF, _EXPONENT = 19, 20
@@ -39,15 +40,20 @@ class View(NamedTuple):
 
 
 def geom_table(
-    geom_type: np.ndarray, geometry: tuple[jax.Array, ...], rgba: jax.Array, materials: np.ndarray
+    geom_type: np.ndarray,
+    geometry: tuple[jax.Array, ...],
+    rgba: jax.Array,
+    materials: np.ndarray,
+    texture: Textures | None,
 ) -> jax.Array:
-    """[G, 24] all that the kernel knows of every geom.
+    """[G, 24] all that the kernel knows of every geom; with textures [G, 40].
 
     Args:
         geom_type: [G] static, MuJoCo's geom types.
         geometry: the other arguments of `raycast.unit_maps`.
         rgba: [G, 4] colours; where alpha is 0 the geom is passed over.
         materials: [G, 3] emission, specular and shininess.
+        texture: [G] with frames that take the camera's, or none.
     """
     maps = raycast.unit_maps(geom_type, *geometry)
     geom_xpos, _, geom_size, cam_xpos, cam_xmat = geometry
@@ -55,6 +61,8 @@ def geom_table(
     radius = jnp.where(rgba[:, 3] > 0, bounding_radius(geom_type, geom_size), -jnp.inf)
     kinds = np.array([raycast.KIND_OF_GEOM.get(int(kind), -1) for kind in geom_type])
     columns = [maps.affine.reshape(-1, 12), maps.stretch, centre, radius, kinds, rgba[:, :3], materials]
+    if texture is not None:
+        columns += [texture.family, texture.rgb, texture.frame.reshape(-1, 12)]
     return jnp.column_stack([jnp.asarray(column, jnp.float32) for column in columns])
 
 
@@ -83,7 +91,7 @@ def paint(
     """The image [H, W, 3] uint8 of a scene without shadows.
 
     Args:
-        geoms: [G, 24] from `geom_table`, in any order that keeps each kind together.
+        geoms: [G, ...] from `geom_table`, in any order that keeps each kind together.
         lights: [L, 21] from `light_table`.
         ranges: static, the first row of each kind and the row after its last.
         view: what the camera sees.
@@ -112,8 +120,8 @@ def _paint_tile(geoms, lights, image, *, ranges, view) -> None:
     west, north = ray(top.astype(jnp.float32), left.astype(jnp.float32))
     east, south = ray((top + _TILE - 1).astype(jnp.float32), (left + _TILE - 1).astype(jnp.float32))
 
-    def affine(geom):
-        return tuple(tuple(geoms[geom, _AFFINE + 4 * i + j] for j in range(4)) for i in range(3))
+    def affine(geom, first=_AFFINE):
+        return tuple(tuple(geoms[geom, first + 4 * i + j] for j in range(4)) for i in range(3))
 
     def in_sight(geom):
         """Whether the geom's ball reaches into the tile's pyramid, whose sides all contain the camera."""
@@ -140,6 +148,9 @@ def _paint_tile(geoms, lights, image, *, ranges, view) -> None:
     point = tuple(jnp.where(hit, distance, 1.0) * x for x in rays)
     normal = raycast.surface_normal(geoms[winner, _KIND], affine(winner), geoms[winner, _STRETCH], point)
     rgb = tuple(geoms[winner, _RGB + i] for i in range(3))
+    if geoms.shape[1] > _FAMILY:
+        second = tuple(geoms[winner, _SECOND + i] for i in range(3))
+        rgb = textures.mix(rgb, geoms[winner, _FAMILY], second, affine(winner, _FRAME), point)
     material = shade.Material(rgb, *(geoms[winner, _MATERIAL + i] for i in range(3)))
 
     def field(light, first: int, last: int) -> Any:

@@ -13,7 +13,8 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
-from milx.render import kernel, raycast, shade
+from milx.render import kernel, raycast, shade, textures
+from milx.render.textures import Textures
 
 _DIRECTIONAL = int(mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
 _SPOT = int(mujoco.mjtLightType.mjLIGHT_SPOT)
@@ -41,6 +42,7 @@ class Scene:
     light_diffuse: jax.Array  # [L, 3]
     light_specular: jax.Array  # [L, 3]
     headlight: jax.Array  # [3, 3] ambient, diffuse and specular colour of the light that shines along the view
+    texture: Textures | None = None  # [G] of every geom, with frames that take the world's; None for none
 
 
 @jax.tree_util.register_dataclass
@@ -142,7 +144,12 @@ class Renderer:
         normal = raycast.normals(self._groups, maps, winner, point)
 
         rgba, made_of = scene.geom_rgba[winner], jnp.asarray(self._materials, float)[winner]
-        material = shade.Material(tuple(rgba[:, i] for i in range(3)), *(made_of[:, i] for i in range(3)))
+        rgb = tuple(rgba[:, i] for i in range(3))
+        if scene.texture is not None:
+            family, second, frame = jax.tree.map(lambda x: x[winner], _in_camera(scene.texture, scene))
+            rows = tuple(tuple(frame[:, i, j] for j in range(4)) for i in range(3))
+            rgb = textures.mix(rgb, family, tuple(second[:, i] for i in range(3)), rows, point)
+        material = shade.Material(rgb, *(made_of[:, i] for i in range(3)))
         color = shade.emitted(material)
         for casts, lights in self._lights(scene).items():
             shadow = partial(self._in_shadow, maps, visible, point) if casts else None
@@ -164,7 +171,8 @@ class Renderer:
 
     def paint(self, scene: Scene, interpret: bool = False) -> jax.Array:
         """`pixels` in one kernel of a GPU, without shadows; `interpret` runs it anywhere, slowly."""
-        geoms = kernel.geom_table(self._model.geom_type, _geometry(scene), scene.geom_rgba, self._materials)
+        texture = None if scene.texture is None else _in_camera(scene.texture, scene)
+        geoms = kernel.geom_table(self._model.geom_type, _geometry(scene), scene.geom_rgba, self._materials, texture)
         order: list[int] = []
         ranges = {}
         for kind, ids in self._groups.items():
@@ -213,6 +221,12 @@ class Renderer:
 def _geometry(scene: Scene) -> tuple[jax.Array, ...]:
     """Poses and sizes of the geoms, and the camera's pose, without gradients."""
     return jax.lax.stop_gradient((scene.geom_xpos, scene.geom_xmat, scene.geom_size, scene.cam_xpos, scene.cam_xmat))
+
+
+def _in_camera(texture: Textures, scene: Scene) -> Textures:
+    """The textures with frames that take the camera's."""
+    pose = jax.lax.stop_gradient((scene.cam_xpos, scene.cam_xmat))
+    return texture._replace(frame=textures.seen_from(jax.lax.stop_gradient(texture.frame), *pose))
 
 
 def _rotate(matrix: jax.Array, vector: jax.Array) -> jax.Array:

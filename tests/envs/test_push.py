@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from mujoco import mjx
 
 from milx.envs import push
 from milx.envs.base import State
@@ -213,3 +214,38 @@ def test_hand_of_the_start_points_down_and_pushes_away_from_the_arm(env, task):
     np.testing.assert_allclose(tip, [-0.42, 0, 0.02], atol=1e-3)
     np.testing.assert_allclose(push_to, [1, 0, 0], atol=2e-2)
     np.testing.assert_allclose(prongs, [0, 0, -1], atol=2e-2)
+
+
+def test_textures_turn_with_their_objects(env, task):
+    state = env.reset(jax.random.key(2), task)
+    data = mujoco.MjData(env.mj_model)
+    data.qpos[:] = state.qpos
+    mujoco.mj_kinematics(env.mj_model, data)
+    frames = env.textures(task, mjx.put_data(env.mj_model, data)).frame
+    local = np.array([0.02, -0.01, 0.03])
+    for i, body in enumerate(env._body):
+        place = data.xpos[body] + data.xmat[body].reshape(3, 3) @ local
+        own = np.asarray(task.texture.frame[i])
+        for geom in env._geom[i]:
+            np.testing.assert_allclose(np.asarray(frames[geom]) @ [*place, 1], own @ [*local, 1], atol=1e-4)
+
+
+def test_the_released_codes_criterion_counts_steps_within_a_wider_circle(env, task):
+    start = env.reset(jax.random.key(2), task)
+    x = NUM_JOINTS + 3 * task.target
+
+    def counts(steps, distance):
+        """Whether it counts by either criterion if the target is so far from the goal in these time steps."""
+        far = jnp.full(env.horizon + 1, 0.5).at[steps].set(distance)
+        qpos = jnp.broadcast_to(start.qpos, (env.horizon + 1, len(start.qpos))).at[:, x].set(far).at[:, x + 1].set(0)
+        states = State(qpos, jnp.zeros_like(qpos), jnp.zeros((env.horizon + 1, 0, 3)))
+        (near,) = env.other_criteria(task, states).values()
+        return bool(env.success(task, states)), bool(near)
+
+    assert counts(slice(-10, None), 0.07) == (True, True)
+    assert counts(slice(-10, None), 0.12) == (False, True)
+    assert counts(slice(-10, None), 0.14) == (False, False)
+    assert counts(slice(-9, None), 0.12) == (False, False)
+    # The state at the start is no step.
+    assert counts(slice(0, 10), 0.12) == (False, False)
+    assert counts(slice(0, 11), 0.12) == (False, True)

@@ -1,0 +1,141 @@
+"""Solid textures: at every point of a thing, how much it shows of a second colour.
+
+A texture is a function of the place in the thing's own frame, so that it turns with the thing and has no seams. Every
+family repeats with a period of about 1 in each direction; a texture's frame scales, turns and shifts it. What is held
+out is a family, not another size of one that was trained on.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from milx.render.raycast import Vector, dot
+
+PERIOD = (0.025, 0.08)
+"""Of a texture (m), drawn uniformly."""
+_TURN = 2 * jnp.pi
+# Directions and phases of the waves that add up to noise.
+_WAVES = ((0.9, 0.4, 0.2, 0.0), (-0.5, 0.8, 0.5, 1.3), (0.3, -0.7, 0.9, 2.9), (1.4, 1.1, -0.8, 4.4))
+
+
+class Textures(NamedTuple):
+    """Textures of geoms; leading axes may stand in front.
+
+    Attributes:
+        family: int32, index into FAMILIES.
+        rgb: [3] the second colour, in [0, 1].
+        frame: [3, 4] linear part and offset of the map from metres, in the thing's frame or the world's, to the
+            family's units.
+    """
+
+    family: jax.Array
+    rgb: jax.Array
+    frame: jax.Array
+
+
+def _wave(x: jax.Array) -> jax.Array:
+    """Of period 1, between -1 and 1."""
+    return jnp.sin(_TURN * x)
+
+
+def _saw(x: jax.Array) -> jax.Array:
+    """Of period 1: distance from the nearest whole number, signed."""
+    return x - jnp.floor(x + 0.5)
+
+
+def _edge(x: jax.Array, sharpness: float) -> jax.Array:
+    """From 0 to 1 where x passes through 0."""
+    return jnp.clip(0.5 + sharpness * x, 0.0, 1.0)
+
+
+def _noise(p: Vector) -> jax.Array:
+    """Waves in directions without a common period, each bent by the one before."""
+    total = bend = jnp.zeros_like(p[0])
+    for x, y, z, phase in _WAVES:
+        bend = jnp.sin(4 * (x * p[0] + y * p[1] + z * p[2]) + phase + 1.5 * bend)
+        total = total + bend / len(_WAVES)
+    return total
+
+
+def _bricks(p: Vector) -> jax.Array:
+    """Rows of 2 x 1, each shifted by half a brick, with joints of the second colour."""
+    row = jnp.floor(p[1] + 0.5)
+    joint = jnp.maximum(jnp.abs(_saw(p[1])), 2 * jnp.abs(_saw(p[0] / 2 + row / 2)) - 0.5)
+    return _edge(joint - 0.38, 12)
+
+
+FAMILIES: dict[str, Callable[[Vector], jax.Array]] = {
+    "plain": lambda p: jnp.zeros_like(p[0]),
+    "stripes": lambda p: _edge(_wave(p[0]), 4),
+    "checks": lambda p: _edge(_wave(p[0]) * _wave(p[1]) * _wave(p[2]), 8),
+    "dots": lambda p: _edge(0.14 - sum(_saw(x) ** 2 for x in p), 20),
+    "noise": lambda p: _edge(_noise(p), 2),
+    "marble": lambda p: _edge(_wave(p[0] + 0.8 * _noise(p)), 1),
+    "waves": lambda p: _edge(_wave(p[0] + 0.3 * _wave(p[1] / 2)), 4),
+    "plaid": lambda p: 0.5 * _edge(_wave(p[0]), 4) + 0.5 * _edge(_wave(p[1]), 4),
+    "rings": lambda p: _edge(_wave(jnp.sqrt(p[0] * p[0] + p[1] * p[1] + 1e-6)), 4),
+    "bricks": _bricks,
+    "zigzag": lambda p: _edge(_wave(p[0] + 2 * jnp.abs(_saw(p[1] / 2))), 4),
+}
+"""How much of the second colour shows, in [0, 1], from places in the family's units."""
+
+SPLITS: dict[str, tuple[str, ...]] = {
+    "train": ("plain", "stripes", "checks", "dots", "noise", "marble"),
+    "validation": ("waves", "plaid"),
+    "test": ("rings", "bricks", "zigzag"),
+}
+"""The names of every split's families. From a family there are as many textures as there are frames and colours."""
+
+
+def _draw_turn(key: jax.Array) -> jax.Array:
+    """A rotation matrix, all equally likely: two random vectors made orthonormal, and the third axis."""
+    first, second = jax.random.normal(key, (2, 3))
+    x = first / jnp.linalg.norm(first)
+    normal = jnp.cross(x, second)
+    z = normal / jnp.linalg.norm(normal)
+    return jnp.stack([x, jnp.cross(z, x), z])
+
+
+def draw(key: jax.Array, split: str) -> Textures:
+    """A texture of one of the split's families, of any size, turn, shift and colour."""
+    names = list(FAMILIES)
+    family_key, turn_key, period_key, shift_key, color_key = jax.random.split(key, 5)
+    family = jax.random.choice(family_key, jnp.array([names.index(name) for name in SPLITS[split]]))
+    turn = _draw_turn(turn_key)
+    period = jax.random.uniform(period_key, minval=PERIOD[0], maxval=PERIOD[1])
+    shift = jax.random.uniform(shift_key, (3, 1))
+    return Textures(family, jax.random.uniform(color_key, (3,)), jnp.concatenate([turn / period, shift], axis=1))
+
+
+def seen_from(frame: jax.Array, xpos: jax.Array, xmat: jax.Array) -> jax.Array:
+    """The map for places in a frame whose origin is at `xpos` and whose axes are the columns of `xmat`: [..., 3, 4]."""
+    high = jax.lax.Precision.HIGHEST
+    linear = jnp.matmul(frame[..., :3], xmat, precision=high)
+    offset = jnp.einsum("...ij,...j->...i", frame[..., :3], xpos, precision=high) + frame[..., 3]
+    return jnp.concatenate([linear, offset[..., None]], axis=-1)
+
+
+def in_world(frame: jax.Array, xpos: jax.Array, xmat: jax.Array) -> jax.Array:
+    """The map for places in the world, where `frame` takes those of a body at this pose: [..., 3, 4]."""
+    back = jnp.swapaxes(xmat, -1, -2)
+    origin = -jnp.einsum("...ij,...j->...i", back, xpos, precision=jax.lax.Precision.HIGHEST)
+    return seen_from(frame, origin, back)
+
+
+def mix(rgb: Vector, family: jax.Array, second: Vector, rows: tuple[Vector, ...], point: Vector) -> Vector:
+    """The colour at each point, three [P] arrays.
+
+    Args:
+        rgb: first colour, three [P] arrays.
+        family: [P], as any type of number.
+        second: second colour.
+        rows: [3][4][P] map from the points to the family's units.
+        point: three [P] arrays.
+    """
+    place = tuple(row[3] + dot(row[:3], point) for row in rows)
+    weight = jnp.zeros_like(place[0])
+    for i, show in enumerate(FAMILIES.values()):
+        weight = jnp.where(family == i, show(place), weight)
+    return tuple(a + weight * (b - a) for a, b in zip(rgb, second, strict=True))
