@@ -70,7 +70,7 @@ FAMILIES: dict[str, Callable[[Vector], jax.Array]] = {
     "plain": lambda p: jnp.zeros_like(p[0]),
     "stripes": lambda p: _edge(_wave(p[0]), 4),
     "checks": lambda p: _edge(_wave(p[0]) * _wave(p[1]) * _wave(p[2]), 8),
-    "dots": lambda p: _edge(0.14 - sum(_saw(x) ** 2 for x in p), 20),
+    "dots": lambda p: _edge(0.14 - (_saw(p[0]) ** 2 + _saw(p[1]) ** 2 + _saw(p[2]) ** 2), 20),
     "noise": lambda p: _edge(_noise(p), 2),
     "marble": lambda p: _edge(_wave(p[0] + 0.8 * _noise(p)), 1),
     "waves": lambda p: _edge(_wave(p[0] + 0.3 * _wave(p[1] / 2)), 4),
