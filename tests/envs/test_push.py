@@ -152,7 +152,8 @@ def test_the_hand_starts_low_enough_for_every_shape(env, task):
 
 
 def test_the_image_is_that_of_the_tasks_own_model(env, task):
-    """Geoms, sizes and colours; what is not used is not seen."""
+    """Geoms, sizes and colours of things without a texture; what is not used is not seen."""
+    task = dataclasses.replace(task, texture=task.texture._replace(family=jnp.zeros(2, jnp.int32)))
     model = c_model(env, task)
     model.geom_rgba[:] = env.colors(task)
     state = env.reset(jax.random.key(5), task)
@@ -168,9 +169,10 @@ def test_the_image_is_that_of_the_tasks_own_model(env, task):
     assert not visible & (set(env._geom.ravel()) - used[0] - used[1])
 
 
-def test_redrawing_changes_colours_alone_and_the_task_blind_forget_the_target_alone(env, task):
+def test_redrawing_changes_looks_alone_and_the_task_blind_forget_the_target_alone(env, task):
     redrawn = env.redraw_appearance(jax.random.key(6), task)
     assert np.abs(redrawn.color - task.color).min() > 0
+    assert np.abs(redrawn.texture.frame - task.texture.frame).min() > 0
     blind = jax.vmap(env.task_blind, in_axes=(0, None))(jax.random.split(jax.random.key(7), 400), task)
     assert abs(np.mean(blind.target) - 0.5) < 4 * 0.5 / 400**0.5
     for field in ("shape", "size", "mass", "damping"):
