@@ -28,17 +28,19 @@ from milx.types import Params
 METHODS = {
     "reach": ("mil", "contextual", "lstm"),
     "reach_state": ("mil", "contextual", "lstm", "lstm_attention"),
+    "push": ("mil", "contextual", "lstm"),
 }
 """What is compared in each environment."""
 
-STEPS = {"reach": 12_000, "reach_state": 10_000}
+STEPS = {"reach": 12_000, "reach_state": 10_000, "push": 30_000}
 """Meta-updates of every method."""
 
 LEARNING_RATES = {
     "reach": {"mil": 3e-3, "contextual": 3e-4, "lstm": 3e-4},
     "reach_state": {"mil": 3e-3, "contextual": 3e-3, "lstm": 3e-3, "lstm_attention": 3e-4},
+    "push": {"mil": 3e-3, "contextual": 3e-4, "lstm": 3e-4},
 }
-"""Peaks of the cosine, as `tune.py` found them on validation tasks."""
+"""Peaks of the cosine, as `tune.py` found them on validation tasks; those of push are reach's."""
 
 
 def methods_of(env: str, chosen: list[str] | None) -> list[str]:
@@ -56,14 +58,14 @@ def methods_of(env: str, chosen: list[str] | None) -> list[str]:
 def configure(env: str, method: str, preset: str, seed: int, steps: int) -> Config:
     """A preset as methods are compared: in `steps` meta-updates, at their own rates, from scenes that are not redrawn.
 
-    A small set of demonstrations is to be small in colours and places, too. Eight time steps of the query and three
-    layers learn faster than the three and two of `fast`, which end a little higher.
+    A small set of demonstrations is to be small in colours and places, too. On vision reach eight time steps of the
+    query and three layers learn faster than the three and two of `fast`, which end a little higher.
     """
     config = config_lib.make_config(env, method, preset, seed)
     config.train.steps, config.train.eval_every = steps, min(4000, steps)
     config.train.redraw = False
     config.optimizer.learning_rate = LEARNING_RATES[env][method]
-    if config.train.query_frames is not None:
+    if env == "reach" and config.train.query_frames is not None:
         config.train.query_frames = 8
         config.network.fc_layers = config.network.fc_layers[:1] * 3
     return config

@@ -8,7 +8,8 @@ def goals(state: jax.Array, indices: tuple[int, ...], height: int | None) -> jax
     """The goal of every time step, [T, G].
 
     Without a `height` it is where the demonstration ends. With one, it is where the hand first comes down from above
-    the middle of its heights to below, and from then on where it is: at what it handles.
+    the middle of its heights to below, and from then on unknown (NaN): where the hand is would be the answer then, and
+    a goal head that learns to find hands does not look for what they are about to handle.
 
     Args:
         state: [T, S] of all time steps.
@@ -21,4 +22,4 @@ def goals(state: jax.Array, indices: tuple[int, ...], height: int | None) -> jax
     z = state[:, height]
     low = z < (z.min() + z.max()) / 2
     down = jnp.argmax(low & (time > jnp.argmin(low)))
-    return place[jnp.maximum(time, down)]
+    return jnp.where(time[:, None] < down, place[down], jnp.nan)

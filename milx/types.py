@@ -43,7 +43,8 @@ class Demo:
         image: [T, H, W, 3] uint8, RGB; None where policies see no pixels.
         state: [T, S] float32; None when the demonstration has no states.
         action: [T, A] float32; None when the demonstration has no actions.
-        goal: [T, G] float32, where the robot was heading (`milx.goals`), in the units of the state; None if unknown.
+        goal: [T, G] float32, where the robot was heading (`milx.goals`), in the units of the state; NaN where
+            unknown, None if it is everywhere.
     """
 
     image: Array = None

@@ -56,10 +56,15 @@ def behavioural_cloning(
 
 
 def goal_loss(predicted: Goal, goal: jax.Array, whitening: Whitening, goal_indices: tuple[int, ...]) -> jax.Array:
-    """The mean negative log likelihood of goals [K, T, G], predicted for all time steps one after the other."""
+    """The mean negative log likelihood of goals [K, T, G], predicted for all time steps one after the other.
+
+    Where a goal is not known (NaN) there is no error.
+    """
     indices = jnp.array(goal_indices)
-    white = (goal - whitening.state_mean[indices]) / whitening.state_scale[indices]
-    return predicted.negative_log_likelihood(white.reshape(-1, len(goal_indices))).mean()
+    white = ((goal - whitening.state_mean[indices]) / whitening.state_scale[indices]).reshape(-1, len(goal_indices))
+    known = jnp.isfinite(white).all(axis=-1)
+    error = predicted.negative_log_likelihood(jnp.where(known[:, None], white, 0.0))
+    return jnp.where(known, error, 0.0).sum() / jnp.maximum(known.sum(), 1)
 
 
 def calibrate_goal_head(

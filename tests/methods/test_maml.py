@@ -252,6 +252,11 @@ def test_goal_head_learns_the_goal_of_each_time_step(batch):
     np.testing.assert_allclose(metrics["goal_loss"], expected, rtol=1e-12)
     np.testing.assert_allclose(loss, metrics["action_loss"] + 0.7 * expected, rtol=1e-12)
 
+    half = dataclasses.replace(demo, goal=demo.goal.at[:, ::2].set(jnp.nan))
+    _, metrics = method.imitation_loss(jnp.asarray(THETA), whitening, half)
+    square = np.mean(np.sum((np.array([0.5, -2.0]) - goals[:, 1::2]) ** 2, axis=-1))
+    np.testing.assert_allclose(metrics["goal_loss"], 0.5 * np.exp(-0.6) * square + np.log(2 * np.pi) + 0.6, rtol=1e-12)
+
     unknown = dataclasses.replace(demo, goal=None)
     loss, metrics = method.imitation_loss(jnp.asarray(THETA), whitening, unknown)
     np.testing.assert_allclose(loss, metrics["action_loss"], rtol=1e-12)
