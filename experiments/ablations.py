@@ -5,10 +5,10 @@
 Stopped and started again it goes on with the next cell.
 """
 
-import pathlib
 from typing import Any
 
 import cells
+import options
 from absl import app, flags
 
 from milx import config as config_lib
@@ -27,17 +27,12 @@ ABLATIONS: dict[str, dict[str, Any]] = {
     "no goal head": {"network.goal_head": False, "mil.goal_weight": 0.0},
 }
 
-_HERE = pathlib.Path(__file__).parent
-_OUT = flags.DEFINE_string("out", str(_HERE / "results" / "ablations"), "Folder of the JSON files.")
-_PRESET = flags.DEFINE_string("preset", "fast", "Hyperparameters of all that is not changed.")
-_STEPS = flags.DEFINE_integer("steps", cells.STEPS["reach"], "Meta-updates of each.")
-_SEEDS = flags.DEFINE_integer("seeds", 2, "Seeds of each.")
 _CHANGED = flags.DEFINE_multi_enum("changed", list(ABLATIONS), list(ABLATIONS), "Which of them; default all.")
 
 
 def configure(changes: dict[str, Any], seed: int) -> Config:
     """A cell of figure 3 with some fields, by dotted name, changed."""
-    config = cells.configure("reach", "mil", _PRESET.value, seed, _STEPS.value)
+    config = cells.configure("reach", "mil", options.PRESET.value, seed, options.STEPS.value)
     for name, value in changes.items():
         config_lib.assign(config, name, value)
     return config
@@ -45,16 +40,16 @@ def configure(changes: dict[str, Any], seed: int) -> Config:
 
 def main(_: list[str]) -> None:
     """Runs what is missing and prints a table."""
-    folder = pathlib.Path(_OUT.value)
+    folder = options.folder("ablations")
     runner = cells.Cells(folder, configure({}, seed=0).data.tasks)
-    for seed in range(_SEEDS.value):
+    for seed in range(options.SEEDS.value):
         for name in _CHANGED.value:
             runner.run(f"{name.replace(' ', '-')}-{seed}", configure(ABLATIONS[name], seed))
     results = cells.read(folder)
-    print("| changed | " + " | ".join(f"seed {seed}" for seed in range(_SEEDS.value)) + " | training |")
-    print("|---|" + "---|" * (_SEEDS.value + 1))
+    print("| changed | " + " | ".join(f"seed {seed}" for seed in range(options.SEEDS.value)) + " | training |")
+    print("|---|" + "---|" * (options.SEEDS.value + 1))
     for name in _CHANGED.value:
-        runs = [results[f"{name.replace(' ', '-')}-{seed}"] for seed in range(_SEEDS.value)]
+        runs = [results[f"{name.replace(' ', '-')}-{seed}"] for seed in range(options.SEEDS.value)]
         shown = [f"{run['success']:.1%} ({run['wilson95'][0]:.1%} to {run['wilson95'][1]:.1%})" for run in runs]
         print(f"| {name} | {' | '.join(shown)} | {runs[0]['wall_clock_s']['train']:.0f} s |")
 

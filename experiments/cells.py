@@ -55,14 +55,15 @@ def methods_of(env: str, chosen: list[str] | None) -> list[str]:
     return [method for method in METHODS[env] if chosen is None or method in chosen]
 
 
-def configure(env: str, method: str, preset: str, seed: int, steps: int) -> Config:
-    """A preset as methods are compared: in `steps` meta-updates, at their own rates, from scenes that are not redrawn.
+def configure(env: str, method: str, preset: str, seed: int, steps: int | None) -> Config:
+    """A preset as methods are compared: at their own rates, in `steps` meta-updates or STEPS, without redrawn scenes.
 
     A small set of demonstrations is to be small in colours and places, too. On vision reach eight time steps of the
     query and three layers learn faster than the three and two of `fast`, which end a little higher.
     """
     config = config_lib.make_config(env, method, preset, seed)
-    config.train.steps, config.train.eval_every = steps, min(4000, steps)
+    config.train.steps = steps or STEPS[env]
+    config.train.eval_every = min(4000, config.train.steps)
     config.train.redraw = False
     config.optimizer.learning_rate = LEARNING_RATES[env][method]
     if env == "reach" and config.train.query_frames is not None:

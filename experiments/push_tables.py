@@ -1,10 +1,10 @@
 """What tables 1 and 2 share: rows of push, each a way to train, evaluated with one demonstration and with five."""
 
-import pathlib
 import statistics
 from typing import Any, NamedTuple
 
 import cells
+import options
 from absl import flags
 
 from milx import config as config_lib
@@ -12,11 +12,7 @@ from milx.config import Config
 
 SHOTS = (1, 5)
 
-_OUT = flags.DEFINE_string("out", None, "Folder of the JSON files; default results/ and the script's name.")
-_PRESET = flags.DEFINE_string("preset", "fast", "Hyperparameters of all that is not changed.")
-_STEPS = flags.DEFINE_integer("steps", cells.STEPS["push"], "Meta-updates of each.")
 _ROWS = flags.DEFINE_list("rows", None, "Which rows; default all.")
-_SEEDS = flags.DEFINE_integer("seeds", 2, "Seeds of each.")
 
 
 class Row(NamedTuple):
@@ -28,7 +24,7 @@ class Row(NamedTuple):
 
 def configure(row: Row, shots: int, seed: int) -> Config:
     """A cell: trained on single demonstrations, in new looks whenever they are drawn."""
-    config = cells.configure("push", row.method, _PRESET.value, seed, _STEPS.value)
+    config = cells.configure("push", row.method, options.PRESET.value, seed, options.STEPS.value)
     config.train.redraw = True
     config.evaluation.shots = shots
     config.evaluation.batch = max(config.evaluation.batch // shots, 1)
@@ -46,9 +42,9 @@ def make(table: str, rows: dict[str, Row]) -> None:
     if unknown := sorted(set(_ROWS.value or ()) - set(rows)):
         raise ValueError(f"rows: got {unknown[0]!r}, expected some of {', '.join(rows)}")
     rows = {name: row for name, row in rows.items() if _ROWS.value is None or name in _ROWS.value}
-    folder = pathlib.Path(_OUT.value or pathlib.Path(__file__).parent / "results" / table)
+    folder = options.folder(table)
     runner = cells.Cells(folder, configure(next(iter(rows.values())), 1, seed=0).data.tasks)
-    for seed in range(_SEEDS.value):
+    for seed in range(options.SEEDS.value):
         for name, row in rows.items():
             for shots in SHOTS:
                 runner.run(f"{name}-{shots}-{seed}", configure(row, shots, seed))
@@ -57,7 +53,7 @@ def make(table: str, rows: dict[str, Row]) -> None:
     for name in rows:
         shown = []
         for shots in SHOTS:
-            runs = [results[f"{name}-{shots}-{seed}"] for seed in range(_SEEDS.value)]
+            runs = [results[f"{name}-{shots}-{seed}"] for seed in range(options.SEEDS.value)]
             success = statistics.mean(run["success"] for run in runs)
             others = (next(iter(run["other_criteria"].values())) for run in runs)
             shown.append(f"{success:.1%} ({statistics.mean(other['success'] for other in others):.1%})")

@@ -5,10 +5,10 @@
 Test tasks are not looked at.
 """
 
-import pathlib
 from typing import Any
 
 import cells
+import options
 from absl import app, flags
 
 from milx import config as config_lib
@@ -26,17 +26,13 @@ CANDIDATES = {
 STEPS = {"reach": 8_000, "reach_state": 5_000, "push": 10_000}
 """Meta-updates of every run, fewer than in figure 3."""
 
-_HERE = pathlib.Path(__file__).parent
-_OUT = flags.DEFINE_string("out", str(_HERE / "results" / "tuning"), "Folder of the JSON files.")
-_PRESET = flags.DEFINE_string("preset", "fast", "Hyperparameters of all that is not changed.")
-_STEPS = flags.DEFINE_integer("steps", None, "Meta-updates; default as in STEPS.")
 _ENVS = flags.DEFINE_list("envs", list(cells.METHODS), "Environments.")
 _METHODS = flags.DEFINE_list("methods", None, "Methods; default all.")
 
 
 def configure(env: str, method: str, candidate: str) -> Config:
     """A short run, validated at its end only; the schedule ends with it."""
-    config = cells.configure(env, method, _PRESET.value, seed=0, steps=_STEPS.value or STEPS[env])
+    config = cells.configure(env, method, options.PRESET.value, seed=0, steps=options.STEPS.value or STEPS[env])
     config.optimizer.learning_rate, config.optimizer.cosine = CANDIDATES[candidate]
     config.train.eval_every = config.train.steps
     return config
@@ -44,10 +40,10 @@ def configure(env: str, method: str, candidate: str) -> Config:
 
 def main(_: list[str]) -> None:
     """Runs what is missing and prints a table."""
-    folder = pathlib.Path(_OUT.value)
+    folder = options.folder("tuning")
     print("| environment | method | " + " | ".join(CANDIDATES) + " |", "|---|---|---|---|---|---|", sep="\n")
     for env in _ENVS.value:
-        runner = cells.Cells(folder, make_config(env, preset=_PRESET.value).data.tasks)
+        runner = cells.Cells(folder, make_config(env, preset=options.PRESET.value).data.tasks)
         for method in cells.methods_of(env, _METHODS.value):
             names = {candidate: f"{env}-{method}-{candidate.replace(', ', '-')}" for candidate in CANDIDATES}
             for candidate, name in names.items():
