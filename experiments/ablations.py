@@ -27,6 +27,7 @@ ABLATIONS: dict[str, dict[str, Any]] = {
     "no goal head": {"network.goal_head": False, "mil.goal_weight": 0.0},
 }
 
+flags.adopt_module_key_flags(options)
 _CHANGED = flags.DEFINE_multi_enum("changed", list(ABLATIONS), list(ABLATIONS), "Which of them; default all.")
 
 

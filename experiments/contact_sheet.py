@@ -1,11 +1,12 @@
-"""Draws all shapes of milx.envs.shapes, validation in yellow and test in red, into one image.
+"""Draws all shapes of milx.envs.shapes, and some textures of every family, validation in yellow and test in red.
 
-python experiments/contact_sheet.py docs/shapes.png
+python experiments/contact_sheet.py docs
 """
 
 import dataclasses
 import pathlib
 import sys
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -15,9 +16,15 @@ import numpy as np
 
 from milx.envs.shapes import SHAPES, SPLITS
 from milx.envs.shapes.primitives import SLOTS, to_geoms
+from milx.render import textures
 from milx.render.scene import Renderer, Scene, to_uint8
 
 COLORS = {"train": (0.35, 0.55, 0.8), "validation": (0.85, 0.7, 0.3), "test": (0.85, 0.4, 0.35)}
+COLUMNS = 14
+SHOWN = "teapot"
+"""The shape that wears the textures."""
+SIZE = 0.045
+"""Its unit of length (m), of the middle of what push draws."""
 _XML = f"""
 <mujoco>
   <worldbody>
@@ -29,35 +36,66 @@ _XML = f"""
 </mujoco>"""
 
 
-def main(path: str) -> None:
-    """Renders and saves."""
+def put(empty: Scene, shape: str, color: Sequence[float]) -> Scene:
+    """A thing on the plane, with its unit as the unit of length."""
+    geoms = to_geoms(SHAPES[shape])
+    matrix = np.zeros((len(geoms.quat), 9))
+    for row, quat in zip(matrix, geoms.quat, strict=True):
+        mujoco.mju_quat2Mat(row, quat)
+    rgba = np.concatenate([np.tile(color, (len(geoms.seen), 1)), geoms.seen[:, None]], axis=1)
+    place = {"xpos": geoms.pos, "xmat": matrix.reshape(-1, 3, 3), "size": geoms.size, "rgba": rgba}
+    fields = {f"geom_{key}": getattr(empty, f"geom_{key}").at[1:].set(value) for key, value in place.items()}
+    return dataclasses.replace(empty, **fields)
+
+
+def wear(scene: Scene, family: str, key: jax.Array) -> Scene:
+    """The scene, its thing in a texture of this family: as `textures.draw` draws it but for the family."""
+    drawn = textures.draw(key, "train")
+    drawn = drawn._replace(
+        family=jnp.asarray(list(textures.FAMILIES).index(family)), frame=drawn.frame.at[:, :3].multiply(SIZE)
+    )
+    num_geoms = len(scene.geom_size)
+    worn = jax.tree.map(lambda x: jnp.zeros((num_geoms, *x.shape), x.dtype).at[1:].set(x), drawn)
+    return dataclasses.replace(scene, texture=worn)
+
+
+def draw(renderer: Renderer, scenes: list[Scene], titles: list[str], path: pathlib.Path) -> None:
+    """One picture of all scenes."""
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *scenes)
+    images = jax.lax.map(lambda scene: to_uint8(renderer.render(scene).color), stacked)
+    rows = -(-len(scenes) // COLUMNS)
+    figure, axes = plt.subplots(rows, COLUMNS, figsize=(COLUMNS, 1.16 * rows), layout="constrained")
+    for axis in axes.ravel():
+        axis.axis("off")
+    for axis, image, title in zip(axes.ravel(), np.asarray(images), titles, strict=False):
+        axis.imshow(image)
+        axis.set_title(title, fontsize=7, pad=2)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def main(folder: str) -> None:
+    """Renders and saves shapes.png and textures.png."""
     model = mujoco.MjModel.from_xml_string(_XML)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     renderer = Renderer(model, "camera", 96, 96, shadows=True)
     empty = renderer.scene(data)
 
-    def scene(name: str, split: str) -> Scene:
-        geoms = to_geoms(SHAPES[name])
-        matrix = np.zeros((len(geoms.quat), 9))
-        for row, quat in zip(matrix, geoms.quat, strict=True):
-            mujoco.mju_quat2Mat(row, quat)
-        rgba = np.concatenate([np.tile(COLORS[split], (len(geoms.seen), 1)), geoms.seen[:, None]], axis=1)
-        place = {"xpos": geoms.pos, "xmat": matrix.reshape(-1, 3, 3), "size": geoms.size, "rgba": rgba}
-        fields = {f"geom_{key}": getattr(empty, f"geom_{key}").at[1:].set(value) for key, value in place.items()}
-        return dataclasses.replace(empty, **fields)
-
     names = [(name, split) for split, names in SPLITS.items() for name in names]
-    scenes = jax.tree.map(lambda *x: jnp.stack(x), *(scene(*pair) for pair in names))
-    images = jax.lax.map(lambda scene: to_uint8(renderer.render(scene).color), scenes)
-    columns = 14
-    figure, axes = plt.subplots(-(-len(names) // columns), columns, figsize=(14, 10.5), layout="constrained")
-    for axis in axes.ravel():
-        axis.axis("off")
-    for axis, image, (name, _) in zip(axes.ravel(), np.asarray(images), names, strict=False):
-        axis.imshow(image)
-        axis.set_title(name.replace("_", " "), fontsize=7, pad=2)
-    figure.savefig(pathlib.Path(path), dpi=110)
+    scenes = [put(empty, name, COLORS[split]) for name, split in names]
+    draw(renderer, scenes, [name.replace("_", " ") for name, _ in names], pathlib.Path(folder) / "shapes.png")
+
+    families = [(name, split) for split, names in textures.SPLITS.items() for name in names]
+    keys = jax.random.split(jax.random.key(0), (len(families), COLUMNS))
+    scenes = [
+        wear(put(empty, SHOWN, COLORS[split]), name, key)
+        for (name, split), row in zip(families, keys, strict=True)
+        for key in row
+    ]
+    draw(
+        renderer, scenes, [name for name, _ in families for _ in range(COLUMNS)], pathlib.Path(folder) / "textures.png"
+    )
 
 
 if __name__ == "__main__":

@@ -24,6 +24,7 @@ TITLES = {
     "push": "push, held-out objects and textures",
 }
 
+flags.adopt_module_key_flags(options)
 _FIGURE = flags.DEFINE_string("figure", None, "Where to draw; default figure3.png in the folder.")
 _ENVS = flags.DEFINE_list("envs", ["reach", "reach_state"], "Environments.")
 _METHODS = flags.DEFINE_list("methods", None, "Methods; default all.")

@@ -12,6 +12,7 @@ from milx.config import Config
 
 SHOTS = (1, 5)
 
+flags.adopt_module_key_flags(options)
 _ROWS = flags.DEFINE_list("rows", None, "Which rows; default all.")
 
 

@@ -8,10 +8,12 @@ Stopped and started again it goes on with the next cell.
 
 import cells
 import push_tables
-from absl import app
+from absl import app, flags
 from push_tables import Row
 
 from milx.config import GIVEN
+
+flags.adopt_module_key_flags(push_tables)
 
 ROWS = {
     f"{method}-{given.replace('+', '-')}": Row(

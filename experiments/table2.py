@@ -6,8 +6,10 @@ Stopped and started again it goes on with the next cell.
 """
 
 import push_tables
-from absl import app
+from absl import app, flags
 from push_tables import Row
+
+flags.adopt_module_key_flags(push_tables)
 
 ROWS = {
     "one-head": Row("mil", {"network.heads": 1}),

@@ -26,6 +26,7 @@ CANDIDATES = {
 STEPS = {"reach": 8_000, "reach_state": 5_000, "push": 10_000}
 """Meta-updates of every run, fewer than in figure 3."""
 
+flags.adopt_module_key_flags(options)
 _ENVS = flags.DEFINE_list("envs", list(cells.METHODS), "Environments.")
 _METHODS = flags.DEFINE_list("methods", None, "Methods; default all.")
 

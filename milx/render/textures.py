@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from milx.render.raycast import Vector, dot
 
-PERIOD = (0.025, 0.08)
+PERIOD = (0.015, 0.045)
 """Of a texture (m), drawn uniformly."""
 _TURN = 2 * jnp.pi
 # Directions and phases of the waves that add up to noise.
