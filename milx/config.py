@@ -269,7 +269,7 @@ def _push_paper() -> Config:
 def _push_fast() -> Config:
     config = _push_paper()
     config.network = NetworkConfig(
-        filters=(16,) * 4,
+        filters=(32,) * 4,
         strides=(2, 2, 2, 1),
         kernel=5,
         mixed_precision=True,
@@ -289,7 +289,7 @@ def _push_cpu() -> Config:
     config.env = EnvConfig(image_shape=(48, 48))
     config.data.tasks, config.data.demos_per_task = 200, 6
     config.network.mixed_precision = False
-    config.network.kernel, config.network.strides = 3, (2, 2, 1, 1)
+    config.network.filters, config.network.kernel, config.network.strides = (16,) * 4, 3, (2, 2, 1, 1)
     config.train = TrainConfig(
         steps=10_000, meta_batch=8, support_frames=4, query_frames=8, redraw=True, eval_every=2500
     )
