@@ -297,6 +297,40 @@ def _push_cpu() -> Config:
     return config
 
 
+def _place_fast() -> Config:
+    return Config(
+        env=EnvConfig(image_shape=(90, 100)),
+        data=DataConfig(tasks=150, demos_per_task=8, noise=0.2, plan_iterations=6),
+        network=NetworkConfig(
+            filters=(32,) * 4,
+            strides=(2, 2, 1, 1),
+            mixed_precision=True,
+            soft_argmax=True,
+            fc_layers=(200, 200, 200),
+            goal_head=True,
+            bias_transformation=20,
+        ),
+        mil=MILConfig(inner_lr=0.03, learn_inner_lr=True, whiten_actions=True, goal_weight=1.0),
+        optimizer=OptimizerConfig(learning_rate=3e-3, warmup=0.05, cosine=True, clip_norm=1.0),
+        train=TrainConfig(meta_batch=32, support_frames=3, query_frames=8, redraw=True),
+        evaluation=EvalConfig(tasks=180, trials=8, baseline_trials=8, batch=90),
+    )
+
+
+def _place_cpu() -> Config:
+    config = _place_fast()
+    config.env = EnvConfig(image_shape=(36, 40))
+    config.data.plan_batch = 100
+    config.network.filters, config.network.strides = (24,) * 3, (2, 1, 1)
+    config.network.mixed_precision = False
+    config.network.fc_layers = (100, 100, 100)
+    config.train = TrainConfig(
+        steps=10_000, meta_batch=8, support_frames=3, query_frames=8, redraw=True, eval_every=2500
+    )
+    config.evaluation = EvalConfig(validation_tasks=25, tasks=90, trials=8, baseline_trials=1, batch=25)
+    return config
+
+
 def _without_pixels(config: Config) -> Config:
     """No convolutions, but all time steps, which cost little now."""
     network = config.network
@@ -309,6 +343,7 @@ def _without_pixels(config: Config) -> Config:
 PRESETS: dict[str, dict[str, Callable[[], Config]]] = {
     "reach": {"paper": _reach_paper, "fast": _reach_fast, "cpu": _reach_cpu},
     "push": {"paper": _push_paper, "fast": _push_fast, "cpu": _push_cpu},
+    "place": {"fast": _place_fast, "cpu": _place_cpu},
     "reach_state": {"fast": _reach_state_fast, "cpu": _reach_state_cpu},
 }
 """Preset factories by environment and name."""

@@ -1,10 +1,11 @@
 """Environments by name."""
 
 from milx.envs.base import SPLITS, Env, State, Task
+from milx.envs.place import Place
 from milx.envs.push import Push
 from milx.envs.reach import Reach, ReachState
 
-ENVS: dict[str, type[Env]] = {env.name: env for env in (Reach, ReachState, Push)}
+ENVS: dict[str, type[Env]] = {env.name: env for env in (Reach, ReachState, Push, Place)}
 
 __all__ = ["ENVS", "SPLITS", "Env", "State", "Task", "make"]
 

@@ -203,12 +203,7 @@ class Push(Env):
 
     def textures(self, task: PushTask, data: mjx.Data) -> Textures:
         """[G] the objects' textures; all else is plain."""
-        geoms, num_geoms = self._geom, self.mj_model.ngeom
-        body = task.texture.frame, data.xpos[self._body], data.xmat[self._body]
-        return jax.tree.map(
-            lambda x: jnp.zeros((num_geoms, *x.shape[1:]), x.dtype).at[geoms].set(x[:, None]),
-            task.texture._replace(frame=textures.in_world(*body)),
-        )
+        return textures.on_geoms(task.texture, self._body, self.mj_model.geom_bodyid, data.xpos, data.xmat)
 
     def guess(self, task: PushTask, state: State) -> jax.Array:
         """[T, 7] what `push_controller` does from here."""

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from milx.render.raycast import Vector, dot
 
@@ -115,6 +116,24 @@ def seen_from(frame: jax.Array, xpos: jax.Array, xmat: jax.Array) -> jax.Array:
     linear = jnp.matmul(frame[..., :3], xmat, precision=high)
     offset = jnp.einsum("...ij,...j->...i", frame[..., :3], xpos, precision=high) + frame[..., 3]
     return jnp.concatenate([linear, offset[..., None]], axis=-1)
+
+
+def on_geoms(
+    texture: Textures, body: np.ndarray, geom_bodyid: np.ndarray, xpos: jax.Array, xmat: jax.Array
+) -> Textures:
+    """[G] textures of all geoms of a model, with frames that take the world's; geoms of other bodies are plain.
+
+    Args:
+        texture: of some bodies, with frames that take the body's.
+        body: static, the ids of those bodies.
+        geom_bodyid: [G] static, the body of each geom.
+        xpos: [..., 3] of all bodies (m).
+        xmat: [..., 3, 3] of all bodies.
+    """
+    posed = texture._replace(frame=in_world(texture.frame, xpos[body], xmat[body]))
+    owner = (geom_bodyid[:, None] == body).argmax(axis=1)
+    worn = jax.tree.map(lambda x: x[owner], posed)
+    return worn._replace(family=jnp.where(np.isin(geom_bodyid, body), worn.family, 0))
 
 
 def in_world(frame: jax.Array, xpos: jax.Array, xmat: jax.Array) -> jax.Array:
