@@ -29,18 +29,20 @@ METHODS = {
     "reach": ("mil", "contextual", "lstm"),
     "reach_state": ("mil", "contextual", "lstm", "lstm_attention"),
     "push": ("mil", "contextual", "lstm"),
+    "place": ("mil", "contextual", "lstm"),
 }
 """What is compared in each environment."""
 
-STEPS = {"reach": 12_000, "reach_state": 10_000, "push": 30_000}
+STEPS = {"reach": 12_000, "reach_state": 10_000, "push": 30_000, "place": 20_000}
 """Meta-updates of every method."""
 
 LEARNING_RATES = {
     "reach": {"mil": 3e-3, "contextual": 3e-4, "lstm": 3e-4},
     "reach_state": {"mil": 3e-3, "contextual": 3e-3, "lstm": 3e-3, "lstm_attention": 3e-4},
     "push": {"mil": 3e-3, "contextual": 3e-4, "lstm": 3e-4},
+    "place": {"mil": 3e-3, "contextual": 3e-4, "lstm": 3e-4},
 }
-"""Peaks of the cosine, as `tune.py` found them on validation tasks; those of push are reach's."""
+"""Peaks of the cosine, as `tune.py` found them on validation tasks; those of push and place are reach's."""
 
 
 def methods_of(env: str, chosen: list[str] | None) -> list[str]:

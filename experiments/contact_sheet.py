@@ -1,4 +1,4 @@
-"""Draws all shapes of milx.envs.shapes, and some textures of every family, validation in yellow and test in red.
+"""Draws all shapes, all containers and some textures of every family, validation in yellow and test in red.
 
 python experiments/contact_sheet.py docs
 """
@@ -14,8 +14,8 @@ import matplotlib.pyplot as plt
 import mujoco
 import numpy as np
 
-from milx.envs.shapes import SHAPES, SPLITS
-from milx.envs.shapes.primitives import SLOTS, to_geoms
+from milx.envs import containers, shapes
+from milx.envs.shapes import primitives
 from milx.render import textures
 from milx.render.scene import Renderer, Scene, to_uint8
 
@@ -25,24 +25,34 @@ SHOWN = "teapot"
 """The shape that wears the textures."""
 SIZE = 0.045
 """Its unit of length (m), of the middle of what push draws."""
-_XML = f"""
+_XML = """
 <mujoco>
   <worldbody>
     <light directional="true" pos="0 0 3" dir="-0.5 0.4 -1" diffuse="0.6 0.6 0.6" specular="0.1 0.1 0.1"/>
     <camera name="camera" pos="0 -3.8 5.2" xyaxes="1 0 0 0 0.745 0.667" fovy="38"/>
     <geom type="plane" size="0 0 0.1" rgba="0.93 0.93 0.9 1"/>
-    {"".join(f'<geom type="{kind}" size="0.1 0.1 0.1"/>' * count for kind, count in SLOTS.items())}
+    {geoms}
   </worldbody>
 </mujoco>"""
 
 
-def put(empty: Scene, shape: str, color: Sequence[float]) -> Scene:
+def stage(slots: dict[str, int]) -> tuple[Renderer, Scene]:
+    """A renderer for things with these geoms, and a scene without any."""
+    geoms = "".join(f'<geom type="{kind}" size="0.1 0.1 0.1"/>' * count for kind, count in slots.items())
+    model = mujoco.MjModel.from_xml_string(_XML.format(geoms=geoms))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    renderer = Renderer(model, "camera", 96, 96, shadows=True)
+    return renderer, renderer.scene(data)
+
+
+def put(empty: Scene, geoms: primitives.Geoms | containers.Geoms, color: Sequence[float]) -> Scene:
     """A thing on the plane, with its unit as the unit of length."""
-    geoms = to_geoms(SHAPES[shape])
     matrix = np.zeros((len(geoms.quat), 9))
     for row, quat in zip(matrix, geoms.quat, strict=True):
         mujoco.mju_quat2Mat(row, quat)
-    rgba = np.concatenate([np.tile(color, (len(geoms.seen), 1)), geoms.seen[:, None]], axis=1)
+    seen = geoms.seen if isinstance(geoms, primitives.Geoms) else geoms.used
+    rgba = np.concatenate([np.tile(color, (len(seen), 1)), seen[:, None]], axis=1)
     place = {"xpos": geoms.pos, "xmat": matrix.reshape(-1, 3, 3), "size": geoms.size, "rgba": rgba}
     fields = {f"geom_{key}": getattr(empty, f"geom_{key}").at[1:].set(value) for key, value in place.items()}
     return dataclasses.replace(empty, **fields)
@@ -75,27 +85,27 @@ def draw(renderer: Renderer, scenes: list[Scene], titles: list[str], path: pathl
 
 
 def main(folder: str) -> None:
-    """Renders and saves shapes.png and textures.png."""
-    model = mujoco.MjModel.from_xml_string(_XML)
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    renderer = Renderer(model, "camera", 96, 96, shadows=True)
-    empty = renderer.scene(data)
-
-    names = [(name, split) for split, names in SPLITS.items() for name in names]
-    scenes = [put(empty, name, COLORS[split]) for name, split in names]
-    draw(renderer, scenes, [name.replace("_", " ") for name, _ in names], pathlib.Path(folder) / "shapes.png")
+    """Renders and saves shapes.png, containers.png and textures.png."""
+    out = pathlib.Path(folder)
+    renderer, empty = stage(primitives.SLOTS)
+    made = {name: primitives.to_geoms(shape) for name, shape in shapes.SHAPES.items()}
+    names = [(name, split) for split, names in shapes.SPLITS.items() for name in names]
+    scenes = [put(empty, made[name], COLORS[split]) for name, split in names]
+    draw(renderer, scenes, [name.replace("_", " ") for name, _ in names], out / "shapes.png")
 
     families = [(name, split) for split, names in textures.SPLITS.items() for name in names]
     keys = jax.random.split(jax.random.key(0), (len(families), COLUMNS))
     scenes = [
-        wear(put(empty, SHOWN, COLORS[split]), name, key)
+        wear(put(empty, made[SHOWN], COLORS[split]), name, key)
         for (name, split), row in zip(families, keys, strict=True)
         for key in row
     ]
-    draw(
-        renderer, scenes, [name for name, _ in families for _ in range(COLUMNS)], pathlib.Path(folder) / "textures.png"
-    )
+    draw(renderer, scenes, [name for name, _ in families for _ in range(COLUMNS)], out / "textures.png")
+
+    renderer, empty = stage(containers.SLOTS)
+    names = [(name, split) for split, names in containers.SPLITS.items() for name in names]
+    scenes = [put(empty, containers.to_geoms(containers.CONTAINERS[name]), COLORS[split]) for name, split in names]
+    draw(renderer, scenes, [name.replace("_", " ") for name, _ in names], out / "containers.png")
 
 
 if __name__ == "__main__":

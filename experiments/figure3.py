@@ -22,6 +22,7 @@ TITLES = {
     "reach": "vision, held-out colours",
     "reach_state": "state, held-out scenes",
     "push": "push, held-out objects and textures",
+    "place": "place, held-out objects and textures",
 }
 
 flags.adopt_module_key_flags(options)

@@ -7,22 +7,27 @@ Stopped and started again it goes on with the next cell.
 """
 
 import cells
-import push_tables
+import tables
 from absl import app, flags
-from push_tables import Row
+from tables import Row, Table
 
 from milx.config import GIVEN
 
-flags.adopt_module_key_flags(push_tables)
+flags.adopt_module_key_flags(tables)
 
-ROWS = {
-    f"{method}-{given.replace('+', '-')}": Row(
-        method,
-        {"mil.given": given, "network.learned_loss": "linear" if method == "mil" and given != GIVEN[0] else None},
-    )
-    for given in GIVEN
-    for method in cells.METHODS["push"]
-}
+TABLE = Table(
+    "table1",
+    "push",
+    {
+        f"{method}-{given.replace('+', '-')}": Row(
+            method,
+            {"mil.given": given, "network.learned_loss": "linear" if method == "mil" and given != GIVEN[0] else None},
+        )
+        for given in GIVEN
+        for method in cells.METHODS["push"]
+    },
+    shots=(1, 5),
+)
 
 if __name__ == "__main__":
-    app.run(lambda _: push_tables.make("table1", ROWS))
+    app.run(lambda _: tables.make(TABLE))

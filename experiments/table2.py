@@ -5,16 +5,18 @@
 Stopped and started again it goes on with the next cell.
 """
 
-import push_tables
+import tables
 from absl import app, flags
-from push_tables import Row
+from tables import Row, Table
 
-flags.adopt_module_key_flags(push_tables)
+flags.adopt_module_key_flags(tables)
 
-ROWS = {
-    "one-head": Row("mil", {"network.heads": 1}),
-    "two-heads": Row("mil", {"network.heads": 2}),
-}
+TABLE = Table(
+    "table2",
+    "push",
+    {"one-head": Row("mil", {"network.heads": 1}), "two-heads": Row("mil", {"network.heads": 2})},
+    shots=(1, 5),
+)
 
 if __name__ == "__main__":
-    app.run(lambda _: push_tables.make("table2", ROWS))
+    app.run(lambda _: tables.make(TABLE))

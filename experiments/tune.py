@@ -23,7 +23,7 @@ CANDIDATES = {
 }
 """Learning rate, and whether it decays to zero along a cosine."""
 
-STEPS = {"reach": 8_000, "reach_state": 5_000, "push": 10_000}
+STEPS = {"reach": 8_000, "reach_state": 5_000, "push": 10_000, "place": 10_000}
 """Meta-updates of every run, fewer than in figure 3."""
 
 flags.adopt_module_key_flags(options)

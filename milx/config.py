@@ -55,6 +55,8 @@ class NetworkConfig:
         filters: output channels of each convolution.
         strides: stride of each convolution.
         kernel: height and width of every kernel.
+        fixed_filters: the first convolution is given and never learned: "kmeans" for a bank of the training images, or
+            a file with VGG-19's first layer (`milx.networks.fixed`); None for one that is learned.
         mixed_precision: convolve in bfloat16; parameters, norms and all other layers stay in float32.
         rematerialise: keep only the inputs of each convolution for the backward pass and compute the rest a second
             time: less memory, more time, the same results.
@@ -75,6 +77,7 @@ class NetworkConfig:
     filters: tuple[int, ...] = (40, 40, 40)
     strides: tuple[int, ...] = (2, 2, 2)
     kernel: int = 3
+    fixed_filters: str | None = None
     mixed_precision: bool = False
     rematerialise: bool = False
     soft_argmax: bool = False
@@ -297,6 +300,27 @@ def _push_cpu() -> Config:
     return config
 
 
+def _place_paper() -> Config:
+    return Config(
+        env=EnvConfig(image_shape=(90, 100)),
+        data=DataConfig(tasks=150, demos_per_task=8, noise=0.2, plan_iterations=6),
+        network=NetworkConfig(
+            filters=(64,) * 5,
+            strides=(2, 2, 2, 1, 1),
+            fixed_filters="kmeans",
+            soft_argmax=True,
+            fc_layers=(100, 100, 100),
+            fc_norm=False,
+            fc_init_std=0.01,
+            goal_head=True,
+            bias_transformation=20,
+        ),
+        mil=MILConfig(inner_steps=5, inner_lr=0.005, inner_clip=30.0, loss_scale=50.0, goal_weight=1.0),
+        train=TrainConfig(steps=50_000, meta_batch=12),
+        evaluation=EvalConfig(tasks=180, trials=8, baseline_trials=8, batch=90),
+    )
+
+
 def _place_fast() -> Config:
     return Config(
         env=EnvConfig(image_shape=(90, 100)),
@@ -343,7 +367,7 @@ def _without_pixels(config: Config) -> Config:
 PRESETS: dict[str, dict[str, Callable[[], Config]]] = {
     "reach": {"paper": _reach_paper, "fast": _reach_fast, "cpu": _reach_cpu},
     "push": {"paper": _push_paper, "fast": _push_fast, "cpu": _push_cpu},
-    "place": {"fast": _place_fast, "cpu": _place_cpu},
+    "place": {"paper": _place_paper, "fast": _place_fast, "cpu": _place_cpu},
     "reach_state": {"fast": _reach_state_fast, "cpu": _reach_state_cpu},
 }
 """Preset factories by environment and name."""

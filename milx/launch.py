@@ -25,7 +25,7 @@ def define_flags() -> None:
     flags.DEFINE_string(
         "preset",
         None,
-        "Hyperparameters: paper (as published; for reach and push), fast (for an accelerator, its default), cpu "
+        "Hyperparameters: paper (as published; not for reach_state), fast (for an accelerator, its default), cpu "
         "(smaller images and networks; the default without an accelerator). --config.path.to.field=value changes any "
         "of them.",
     )

@@ -8,6 +8,7 @@ learning_curve.png, rollouts.gif
 """
 
 import contextlib
+import dataclasses
 import functools
 import json
 import pathlib
@@ -31,6 +32,7 @@ from milx.data.demos import DemoSet
 from milx.envs.base import State
 from milx.methods.random import Random
 from milx.metrics import MetricsWriter
+from milx.networks import fixed
 from milx.policy import params_like, spec_of
 from milx.trainer import Trainer, TrainState, make_optimizer
 from milx.types import Params
@@ -75,7 +77,20 @@ def initial_state(trainer: Trainer, config: Config, train: DemoSet) -> tuple[Tra
         raise ValueError(f"data: at most {most} demonstrations of a task succeed, expected more than {shots}")
     init_key, batch_key = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), 3))
     statistics = whitening.fit(_robot_states(trainer.env, train.states), train.action, config.mil.whiten_actions)
-    return trainer.init(init_key, statistics), batch_key
+    state = trainer.init(init_key, statistics)
+    if config.network.fixed_filters is None or not trainer.env.vision:
+        return state, batch_key
+    if config.network.fixed_filters == fixed.KMEANS:
+        filters = fixed.cluster(_first_images(trainer.env, train), config.network)
+    else:
+        filters = fixed.load(config.network.fixed_filters, config.network)
+    return dataclasses.replace(state, params=fixed.put(state.params, filters)), batch_key
+
+
+def _first_images(env: envs.Env, train: DemoSet) -> np.ndarray:
+    """[N, H, W, 3] what a demonstration of each of the first 128 tasks shows first."""
+    task, states = jax.tree.map(lambda x: x[:128], (train.task, train.states))
+    return np.asarray(jax.jit(jax.vmap(env.render))(task, jax.tree.map(lambda x: x[:, 0, 0], states)))
 
 
 @functools.partial(jax.jit, static_argnums=0)

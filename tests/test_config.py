@@ -60,7 +60,7 @@ def test_unknown_field_is_refused_and_the_valid_ones_listed(values, message, val
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"env": "nope"}, "env: got 'nope', expected one of reach, push, reach_state"),
+        ({"env": "nope"}, "env: got 'nope', expected one of reach, push, place, reach_state"),
         ({"env": "reach", "preset": "nope"}, "preset: got 'nope', expected one of paper, fast, cpu"),
     ],
 )

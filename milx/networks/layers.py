@@ -215,6 +215,28 @@ class ConvBlock(nn.Module):
         return shifted_relu(layer_norm(add_bias(x, bias)), centre, dtype)
 
 
+class FixedConv(nn.Module):
+    """Convolution, bias, ReLU that no gradient reaches; zero until `milx.networks.fixed` puts filters in.
+
+    Attributes:
+        filters, kernel, stride, mixed_precision: as in `ConvBlock`.
+    """
+
+    filters: int
+    kernel: int
+    stride: int
+    mixed_precision: bool = False
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        """Maps [B, H, W, 3] to [B, ceil(H / stride), ceil(W / stride), F]."""
+        shape = (self.kernel, self.kernel, x.shape[-1], self.filters)
+        kernel = jax.lax.stop_gradient(self.param("fixed_kernel", nn.initializers.zeros, shape))
+        bias = jax.lax.stop_gradient(self.param("fixed_bias", nn.initializers.zeros, (self.filters,)))
+        dtype = jnp.bfloat16 if self.mixed_precision else kernel.dtype
+        return nn.relu(conv2d(x.astype(dtype), kernel.astype(dtype), self.stride) + bias.astype(dtype))
+
+
 class Dense(nn.Module):
     """A fully connected layer, followed by layer norm and ReLU if it is hidden.
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from milx.config import NetworkConfig
 from milx.networks.goal import Goal, GoalHead, StateGoalHead
-from milx.networks.layers import ConvBlock, Dense, SpatialSoftArgmax
+from milx.networks.layers import ConvBlock, Dense, FixedConv, SpatialSoftArgmax
 from milx.networks.learned_loss import LearnedLoss
 from milx.types import Params
 
@@ -56,7 +56,8 @@ class ConvStack(nn.Module):
         x = image.astype(dtype) / 255.0
         block = nn.remat(ConvBlock) if config.rematerialise else ConvBlock
         for i, (filters, stride) in enumerate(zip(config.filters, config.strides, strict=True)):
-            x = block(filters, config.kernel, stride, config.mixed_precision, name=f"ConvBlock_{i}")(x)
+            layer = FixedConv if i == 0 and config.fixed_filters else block
+            x = layer(filters, config.kernel, stride, config.mixed_precision, name=f"ConvBlock_{i}")(x)
         return x.astype(dtype)
 
 

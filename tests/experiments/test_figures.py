@@ -8,12 +8,12 @@ import pytest
 sys.path.insert(0, str(pathlib.Path(__file__).parents[2] / "experiments"))
 import cells
 import figure3
-import push_tables
 import table1
 import table2
+import table3
+import tables
 
-from milx import methods
-from milx.envs.push import Push
+from milx import envs, methods
 from milx.policy import spec_of
 
 
@@ -29,22 +29,22 @@ def test_a_point_is_the_mean_of_its_seeds_within_all_their_intervals():
     assert curves["reach", "lstm"][500] == pytest.approx((0.1, 0.0, 0.2, 1))
 
 
-@pytest.mark.parametrize("rows", [table1.ROWS, table2.ROWS])
-def test_rows_of_push_are_trained_once_for_all_shots_and_each_on_its_own(rows, tmp_path, flags):
-    spec, runner, programs = spec_of(Push((48, 48))), cells.Cells(tmp_path, 769), set()
-    for row in rows.values():
-        one, five = (push_tables.configure(row, shots, seed=0) for shots in push_tables.SHOTS)
-        methods.make(one, spec)  # refuses what does not fit together
-        assert runner._programs(one) == runner._programs(five)
-        assert (one.evaluation.shots, five.evaluation.shots) == (1, 5)
-        programs.add(runner._programs(one))
-    assert len(programs) == len(rows)
+@pytest.mark.parametrize("table", [table1.TABLE, table2.TABLE, table3.TABLE], ids=lambda table: table.name)
+def test_rows_are_trained_once_for_all_shots_and_each_on_its_own(table, tmp_path, flags):
+    spec, runner, programs = spec_of(envs.make(table.env, (48, 48))), cells.Cells(tmp_path, 1), set()
+    for row in table.rows.values():
+        of_shots = [tables.configure(table.env, row, shots, seed=0) for shots in table.shots]
+        methods.make(of_shots[0], spec)  # refuses what does not fit together
+        assert len({runner._programs(config) for config in of_shots}) == 1
+        assert tuple(config.evaluation.shots for config in of_shots) == table.shots
+        programs.add((runner._programs(of_shots[0]), of_shots[0].data.tasks))
+    assert len(programs) == len(table.rows)
 
 
 def test_an_unknown_row_is_refused(flags):
-    flags.rows = ["mil-vidoe"]
-    with pytest.raises(ValueError, match="rows: got 'mil-vidoe', expected some of one-head, two-heads"):
-        push_tables.make("table2", table2.ROWS)
+    flags.rows = ["two-haeds"]
+    with pytest.raises(ValueError, match="rows: got 'two-haeds', expected some of one-head, two-heads"):
+        tables.make(table2.TABLE)
 
 
 @pytest.fixture
