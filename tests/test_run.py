@@ -1,6 +1,7 @@
 """A run's folder: what is in it, and that an interrupted run ends like one that was never interrupted."""
 
 import copy
+import dataclasses
 import json
 import re
 import time
@@ -12,11 +13,13 @@ from tiny import QUIET, tiny_config
 
 import milx
 from milx import config as config_lib
+from milx import methods
 from milx.checkpoint import Checkpoints
 from milx.data import demos as demos_lib
 from milx.metrics import MetricsWriter
+from milx.networks import fixed
 from milx.policy import params_like, spec_of
-from milx.run import Run
+from milx.run import Run, initial_state
 
 RESULT_FIELDS = {
     *("env", "method", "preset", "variant", "seed", "num_tasks_train", "num_demos_train", "shots", "given"),
@@ -98,6 +101,19 @@ def test_training_changes_the_parameters_but_not_the_whitening(trained):
     seen = jax.jit(jax.vmap(jax.vmap(jax.vmap(trained.run.env.robot_state))))(trained.train.states)
     mean = np.asarray(seen, np.float64).mean(axis=(0, 1, 2))
     np.testing.assert_allclose(items["params"]["whitening"].state_mean, mean, atol=1e-5)
+
+
+def test_a_fixed_first_layer_is_made_from_what_the_training_demonstrations_show_first(trained):
+    config = tiny_config()
+    config.network.fixed_filters = "kmeans"
+    trainer = dataclasses.replace(trained.run.trainer, method=methods.make(config, spec_of(trained.run.env)))
+    state, _ = initial_state(trainer, config, trained.train)
+    first = jax.tree.map(lambda x: x[:, 0, 0], trained.train.states)
+    images = jax.jit(jax.vmap(trainer.env.render))(trained.train.task, first)
+    expected = fixed.cluster(np.asarray(images), config.network)
+    layer = state.params["policy"]["vision"]["ConvBlock_0"]
+    np.testing.assert_array_equal(layer["fixed_kernel"], expected.kernel)
+    assert np.abs(expected.kernel).max() > 0.1
 
 
 @pytest.mark.parametrize(
