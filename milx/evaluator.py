@@ -128,11 +128,11 @@ def baselines(env: Env, demos: DemoSet, config: EvalConfig, expert: DataConfig, 
 
 @functools.partial(jax.jit, static_argnums=0)
 def film(camera: Env, task: Task, states: State) -> jax.Array:
-    """Images [N, T + 1, H, W, 3] uint8 of episodes of N tasks: `states` has leading axes [N, T + 1].
+    """Images [N, F, H, W, 3] uint8 of episodes of N tasks: `states` has leading axes [N, T + 1].
 
     `camera` is the environment with the wanted image size.
     """
-    return jax.vmap(jax.vmap(camera.render, in_axes=(None, 0)))(task, states)
+    return jax.vmap(camera.film)(task, states)
 
 
 def summary(trials: Trials) -> dict[str, Any]:

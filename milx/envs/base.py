@@ -232,7 +232,14 @@ class Env(abc.ABC):
     @functools.partial(jax.jit, static_argnums=0)
     def render(self, task: Task, state: State) -> jax.Array:
         """The camera's image [H, W, 3] uint8 of the task's scene."""
-        model = self.model_of(task)
+        return self._draw(self.model_of(task), task, state)
+
+    def film(self, task: Task, states: State) -> jax.Array:
+        """Images [F, H, W, 3] uint8 of an episode, whose `states` have a leading axis T + 1, and of what follows it."""
+        return jax.vmap(self.render, in_axes=(None, 0))(task, states)
+
+    def _draw(self, model: mjx.Model, task: Task, state: State) -> jax.Array:
+        """The image of a state in this model."""
         data = mjx.kinematics(model, self.data(state))
         data = mjx.camlight(model, mjx.com_pos(model, data))
         scene = dataclasses.replace(

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from jax.scipy.spatial.transform import Rotation
 from mujoco import mjx
 
 from milx.envs import containers
@@ -92,7 +93,8 @@ class Drop:
     def start(self, thing: Geoms, unit: jax.Array, tip: jax.Array, turn: jax.Array) -> Fall:
         """The thing at rest, held at `tip` [3] (m) with axes `turn` [3, 3] (columns)."""
         middle = tip + turn[:, 2] * unit * _middle(thing)
-        return Fall(jnp.concatenate([middle, _quaternion(turn)]), jnp.zeros(6))
+        quat = jnp.roll(Rotation.from_matrix(turn).as_quat(), 1)
+        return Fall(jnp.concatenate([middle, quat]), jnp.zeros(6))
 
     @functools.partial(jax.jit, static_argnums=0)
     def fall(
@@ -104,27 +106,28 @@ class Drop:
         place: jax.Array,
         tip: jax.Array,
         turn: jax.Array,
-    ) -> Fall:
-        """The thing SECONDS after it was let go; for the arguments see `model_of` and `start`."""
+    ) -> tuple[Fall, Fall]:
+        """The thing SECONDS after it was let go, and in all time steps before, with a leading axis.
+
+        For the arguments see `model_of` and `start`.
+        """
         model = self.model_of(thing, unit, container, width, place)
 
-        def step(fall: Fall, _: None) -> tuple[Fall, None]:
+        def step(fall: Fall, _: None) -> tuple[Fall, Fall]:
             data = mjx.step(model, self._data.replace(qpos=fall.qpos, qvel=fall.qvel))
-            return Fall(data.qpos, data.qvel), None
+            return Fall(data.qpos, data.qvel), fall
 
-        return jax.lax.scan(step, self.start(thing, unit, tip, turn), length=round(SECONDS / TIMESTEP))[0]
+        return jax.lax.scan(step, self.start(thing, unit, tip, turn), length=round(SECONDS / TIMESTEP))
+
+    def held_at(self, thing: Geoms, unit: jax.Array, fall: Fall) -> tuple[jax.Array, Rotation]:
+        """Where the point is by which the thing was held [3] (m), and how the thing is turned: `start`'s inverse."""
+        turn = Rotation.from_quat(jnp.roll(fall.qpos[3:], -1))
+        return fall.qpos[:3] - turn.as_matrix()[:, 2] * unit * _middle(thing), turn
 
 
 def _middle(thing: Geoms) -> jax.Array:
     """Height of the first capsule's axis, in the thing's unit of length: its centre of mass is there."""
     return thing.pos[0, 2]
-
-
-def _quaternion(turn: jax.Array) -> jax.Array:
-    """[4] of a rotation matrix whose angle is well below half a turn."""
-    w = jnp.sqrt(jnp.maximum(1 + jnp.trace(turn), 1e-6)) / 2
-    skew = jnp.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
-    return jnp.concatenate([w[None], skew / (4 * w)])
 
 
 def _build() -> mujoco.MjModel:

@@ -8,11 +8,13 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from jax.scipy.spatial.transform import Rotation
 from mujoco import mjx
 
 from milx.envs import containers, drop, shapes
 from milx.envs.base import ASSETS, Env, State, check_split
 from milx.envs.containers import CONTAINERS
+from milx.envs.drop import Fall
 from milx.envs.shapes import SHAPES, primitives
 from milx.render import textures
 from milx.render.textures import Textures
@@ -32,6 +34,8 @@ MAX_SPEED, MAX_TURN = 0.4, 1.5
 """What an action of 1 asks of the hand: m/s and rad/s."""
 CLEARANCE = 0.02
 """Gap between the thing and the rim when the hand opens over a container (m)."""
+FALL_FRAMES = 10
+"""Images of the fall in a film."""
 START_NOISE = 0.12
 """Joints start within so much of _START (rad)."""
 OFF_COST, TURN_COST, ACTION_COST = 5.0, 0.5, 0.25
@@ -221,8 +225,8 @@ class Place(Env):
         upright = jnp.concatenate([axes[:, 0] + jnp.array([0.0, 0.0, 1.0]), axes[:, 2] - jnp.array([1.0, 0.0, 0.0])])
         return jnp.concatenate([OFF_COST * (tip - goal), TURN_COST * upright])
 
-    def falls(self, task: PlaceTask, state: State) -> tuple[jax.Array, jax.Array]:
-        """Position [3] (m) and velocity [3] (m/s) of the thing, drop.SECONDS after the hand has opened.
+    def falls(self, task: PlaceTask, state: State) -> tuple[Fall, Fall]:
+        """The thing when it has fallen, and on its way, from the moment in which the hand opens (`milx.envs.drop`).
 
         It can hit the container whose middle is closest under the hand, and the table.
         """
@@ -232,17 +236,37 @@ class Place(Env):
         under = jnp.argmin(jnp.linalg.norm(state.mocap_pos[:, :2] - tip[:2], axis=-1))
         thing, *_ = self._geoms_of(task)
         container = jax.tree.map(lambda x: x[task.container[under]], self._containers)
-        end = self._drop.fall(*thing, container, task.container_size[under], state.mocap_pos[under], tip, turn)
-        return end.qpos[:3], end.qvel[:3]
+        return self._drop.fall(*thing, container, task.container_size[under], state.mocap_pos[under], tip, turn)
+
+    def film(self, task: PlaceTask, states: State) -> jax.Array:
+        """Images [T + 1 + FALL_FRAMES, H, W, 3] uint8 of an episode and of the fall that follows it."""
+        last, model = jax.tree.map(lambda x: x[-1], states), self.model_of(task)
+        thing, *_ = self._geoms_of(task)
+        data = mjx.kinematics(model, self.data(last))
+        hand = Rotation.from_matrix(data.xmat[self._hand].reshape(3, 3))
+
+        def draw(fall: Fall) -> jax.Array:
+            place, turn = self._drop.held_at(*thing, fall)
+            pos = hand.inv().apply(place - data.xpos[self._hand])
+            quat = jnp.roll((hand.inv() * turn).as_quat(), 1)
+            body = self._body[0]
+            moved = model.replace(
+                body_pos=model.body_pos.at[body].set(pos), body_quat=model.body_quat.at[body].set(quat)
+            )
+            return self._draw(moved, task, last)
+
+        _, way = self.falls(task, last)
+        shown = jax.tree.map(lambda x: x[np.linspace(0, len(x) - 1, FALL_FRAMES).astype(int)], way)
+        return jnp.concatenate([super().film(task, states), jax.vmap(draw)(shown)])
 
     def success(self, task: PlaceTask, states: State) -> jax.Array:
         """Whether the thing rests within the target's rim, seen from above."""
         last = jax.tree.map(lambda x: x[-1], states)
-        place, velocity = self.falls(task, last)
+        end, _ = self.falls(task, last)
         rim = jax.tree.map(lambda x: x[task.container[task.target]], self._containers)
-        off = (place[:2] - last.mocap_pos[task.target, :2]) / (task.container_size[task.target] * rim.half)
+        off = (end.qpos[:2] - last.mocap_pos[task.target, :2]) / (task.container_size[task.target] * rim.half)
         inside = jnp.where(rim.round, jnp.linalg.norm(off), jnp.abs(off).max()) < 1
-        return inside & (jnp.linalg.norm(velocity) < drop.STILL)
+        return inside & (jnp.linalg.norm(end.qvel[:3]) < drop.STILL)
 
     def task_blind(self, key: jax.Array, task: PlaceTask) -> PlaceTask:
         """The task with a random container as the target."""

@@ -136,7 +136,8 @@ def dropped(env):
 
 
 def test_what_is_let_go_over_the_middle_of_a_container_comes_to_rest_in_it(env, dropped):
-    tasks, states, (end, velocity) = dropped
+    tasks, states, (fallen, _) = dropped
+    end, velocity = fallen.qpos[:, :3], fallen.qvel[:, :3]
     count = len(tasks.target)
     middle = states.mocap_pos[np.arange(count), tasks.target]
     assert np.linalg.norm(velocity, axis=-1).max() < drop.STILL
@@ -150,7 +151,7 @@ def test_what_is_let_go_over_the_middle_of_a_container_comes_to_rest_in_it(env, 
 
 def test_the_fall_is_that_of_mujoco(env, dropped):
     """Where it comes to rest; on the way contacts differ, as MJX finds fewer points on a box."""
-    tasks, states, (end, _) = dropped
+    tasks, states, (fallen, _) = dropped
     off = []
     for i in range(len(tasks.target)):
         task, state = (jax.tree.map(lambda x, i=i: x[i], tree) for tree in (tasks, states))
@@ -165,8 +166,7 @@ def test_the_fall_is_that_of_mujoco(env, dropped):
         data.qpos[:], data.qvel[:] = start
         for _ in range(round(drop.SECONDS / drop.TIMESTEP)):
             mujoco.mj_step(model, data)
-        off.append(np.linalg.norm(data.qpos[:3] - end[i]))
-    print(np.round(off, 4))
+        off.append(np.linalg.norm(data.qpos[:3] - fallen.qpos[i, :3]))
     assert np.median(off) < 2e-3
     assert np.quantile(off, 0.9) < 0.02
 
@@ -179,7 +179,7 @@ def test_only_what_lies_still_within_the_targets_rim_counts(env, task):
             self.__dict__.update(env.__dict__)
 
         def falls(self, task, state):
-            return jnp.append(end, 0.02), jnp.array([speed, 0.0, 0.0])
+            return drop.Fall(jnp.append(end, 0.02), jnp.array([speed, 0.0, 0.0])), None
 
     def counts(name, off, moving):
         nonlocal end, speed
@@ -279,6 +279,20 @@ def test_the_thing_hangs_from_the_tip_and_stays_in_the_hand(env, task):
             }[kind]
             tops.append(data.geom_xpos[geom, 2] + reach)
         assert max(tops) == pytest.approx(float(env.hand(state.qpos)[0][2]), abs=1e-6)
+
+
+def test_a_film_goes_on_with_the_fall_from_where_the_hand_held_the_thing(env, dropped):
+    tasks, states, (fallen, _) = jax.tree.map(lambda x: x[3], dropped)
+    frames = jax.jit(Place((72, 80)).film)(tasks, jax.tree.map(lambda x: x[None], states)).astype(int)
+    assert len(frames) == 1 + place.FALL_FRAMES
+    np.testing.assert_allclose(frames[1], frames[0], atol=1)
+    assert (np.abs(frames[-1] - frames[0]).max(axis=-1) > 8).sum() > 5
+    # Back from the last position to the point by which it was held, and there again.
+    thing, unit = env._geoms_of(tasks)[0]
+    point, turn = env._drop.held_at(thing, unit, fallen)
+    again = env._drop.start(thing, unit, point, turn.as_matrix()).qpos
+    np.testing.assert_allclose(again[:3], fallen.qpos[:3], atol=1e-9)
+    assert abs(again[3:] @ fallen.qpos[3:]) == pytest.approx(1, abs=1e-9)
 
 
 def test_the_task_blind_forget_the_target_alone(env, task):
