@@ -21,7 +21,8 @@ from milx.config import Config
 from milx.data import demos as demos_lib
 from milx.data.demos import DemoSet
 from milx.policy import spec_of
-from milx.run import check_steps, initial_state, split_demos, trial_key
+from milx.run import check_steps, initial_state
+from milx.simulation import split_demos, training_on, trial_key
 from milx.trainer import Trainer, make_optimizer
 from milx.types import Params
 
@@ -111,22 +112,29 @@ class Cells:
         path = self.folder / f"{name}.json"
         if not path.is_file():
             return False
-        theirs = config_lib.to_dict(config_lib.from_dict(json.loads(path.read_text())["config"]))
-        if changed := config_lib.differences(theirs, config_lib.to_dict(config)):
+        theirs = config_lib.from_dict(json.loads(path.read_text())["config"])
+        if changed := config_lib.differences(_contents(theirs), _contents(config)):
             raise ValueError(f"{path}: holds another cell: {'; '.join(changed)}")
         return True
 
-    def run(self, name: str, config: Config) -> None:
-        """Trains and evaluates a cell and writes `name`.json; returns at once if that is done.
+    def run(self, named: dict[str, Config]) -> None:
+        """Trains and evaluates those of the cells that are not done, and writes `name`.json of each.
 
-        Times of demonstrations and baselines count for the cell that was the first to need them.
+        Cells that differ in their evaluation only are trained once and written together at the end. Times of
+        demonstrations and baselines count for the cell that was the first to need them.
         """
-        if self.is_done(name, config):
-            return
-        self._check(config)
+        missing = {name: config for name, config in named.items() if not self.is_done(name, config)}
+        for config in missing.values():
+            self._check(config)
+        finished = {name: self._run(name, config) for name, config in missing.items()}
+        for name, result in finished.items():
+            self.write(name, result)
+            print(f"{name}: {result['success']:.1%}, {result['wall_clock_s']['total']:.0f} s", flush=True)
+
+    def _run(self, name: str, config: Config) -> dict[str, Any]:
         clock = [time.perf_counter()]
-        trainer, evaluation = self._trainer(config), config.evaluation
-        env, train, test = trainer.env, self._first_tasks(config), self._demos(config, "test")
+        env, method, evaluation = self._env(config), self._trainer(config).method, config.evaluation
+        train, test = self._first_tasks(config), self._demos(config, "test")
         floors = self._once(
             ("floors", config.env_name),
             lambda: evaluator.baselines(env, test, evaluation, config.data, trial_key("test")),
@@ -134,16 +142,15 @@ class Cells:
         clock.append(time.perf_counter())
         trained = self.train(name, config)
         clock.append(time.perf_counter())
-        trials = evaluator.run_trials(env, trainer.method, trained.params, test, evaluation, trial_key("test"))
-        summary = evaluator.summary(trials)
+        trials = evaluator.run_trials(env, method, trained.params, test, evaluation, trial_key("test"))
+        found = evaluator.describe(env, config, trials, floors)
         clock.append(time.perf_counter())
         demos_s, _, evaluate_s = (later - earlier for earlier, later in itertools.pairwise(clock))
         seconds = {"demos": demos_s, **trained.seconds, "evaluate": trained.seconds["evaluate"] + evaluate_s}
         seconds["total"] = sum(seconds.values())
         digest = demos_lib.fingerprint(train)
-        result = results.describe(config, env, summary, floors, seconds, trained.step, digest)
-        self.write(name, result | {"validation_success": trained.validation})
-        print(f"{name}: {summary['success']:.1%}, {seconds['total']:.0f} s", flush=True)
+        result = results.describe(config, found, seconds, trained.step, digest)
+        return result | {"validation_success": trained.validation}
 
     def write(self, name: str, result: dict[str, Any]) -> None:
         """Writes a cell's file."""
@@ -167,11 +174,12 @@ class Cells:
         check_steps(config)
 
     def _train(self, name: str, config: Config) -> Trained:
-        trainer, train, every = self._trainer(config), self._first_tasks(config), config.train.log_every
+        env, trainer, every = self._env(config), self._trainer(config), config.train.log_every
+        train = self._first_tasks(config)
         evaluation = dataclasses.replace(config.evaluation, shots=config.train.shots)
         validation = self._demos(dataclasses.replace(config, evaluation=evaluation), "validation")
         repeated = jax.tree.map(lambda x: jnp.concatenate([x] * (self.capacity // config.data.tasks)), train)
-        state, key = initial_state(trainer, config, repeated)
+        state, key = initial_state(trainer, config, training_on(env, config, repeated))
         seconds, began = dict.fromkeys(("compile", "train", "evaluate"), 0.0), time.perf_counter()
 
         def lap(name: str) -> None:
@@ -180,7 +188,7 @@ class Cells:
             seconds[name] += now - began
             began = now
 
-        options = platform.pixel_options(trainer.env.chain)
+        options = platform.pixel_options(env.chain)
         compiled = self._once(
             ("compiled", self._programs(config)),
             lambda: Trainer.run.lower(trainer, state, repeated, key, every).compile(options),
@@ -193,9 +201,8 @@ class Cells:
             if step % config.train.eval_every == 0 or step == config.train.steps:
                 loss = float(metrics["loss"])
                 lap("train")
-                trials = evaluator.run_trials(
-                    trainer.env, trainer.method, state.params, validation, evaluation, trial_key("validation")
-                )
+                key_of_trials = trial_key("validation")
+                trials = evaluator.run_trials(env, trainer.method, state.params, validation, evaluation, key_of_trials)
                 success = float(trials.success.mean())
                 lap("evaluate")
                 print(f"  {name} {step}: loss {loss:.3f}, validation {success:.1%}", flush=True)
@@ -203,11 +210,15 @@ class Cells:
         return Trained(*best, seconds)
 
     def _trainer(self, config: Config) -> Trainer:
-        name, image_shape = config.env_name, config.env.image_shape
-        env = self._once(("env", name, image_shape), lambda: envs.make(name, image_shape))
+        env = self._env(config)
         optimizer = make_optimizer(config.optimizer, config.train.steps)
-        make = lambda: Trainer(env, methods.make(config, spec_of(env)), config.train, optimizer)  # noqa: E731
+        method = methods.make(config, spec_of(env))
+        make = lambda: Trainer(demos_lib.sampler(env, config.train), method, config.train, optimizer)  # noqa: E731
         return self._once(("trainer", self._programs(config)), make)
+
+    def _env(self, config: Config) -> envs.Env:
+        name, image_shape = config.env_name, config.env.image_shape
+        return self._once(("env", name, image_shape), lambda: envs.make(name, image_shape))
 
     def _programs(self, config: Config) -> str:
         """All on which the compiled programs of training depend."""
@@ -221,7 +232,7 @@ class Cells:
     def _demos(self, config: Config, split: str) -> DemoSet:
         """Validation or test tasks, or the training tasks of the largest cell with the same seed."""
         whole = dataclasses.replace(config, data=dataclasses.replace(config.data, tasks=self.capacity))
-        env = self._trainer(config).env
+        env = self._env(config)
         which = config.seed if split == "train" else config.evaluation.shots
         return self._once(("demos", config.env_name, split, which), lambda: split_demos(env, whole, split))
 
@@ -229,6 +240,13 @@ class Cells:
         if key not in self._made:
             self._made[key] = make()
         return self._made[key]
+
+
+def _contents(config: Config) -> dict[str, Any]:
+    """What makes a cell: how much runs at once does not."""
+    values = config_lib.to_dict(config)
+    del values["evaluation"]["batch"], values["data"]["plan_batch"]
+    return values
 
 
 def read(folder: pathlib.Path) -> dict[str, dict[str, Any]]:

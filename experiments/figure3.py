@@ -45,7 +45,7 @@ def run_cells() -> None:
                     if seed < (_END_SEEDS.value if at_end else options.SEEDS.value):
                         config = cells.configure(env, method, options.PRESET.value, seed, options.STEPS.value)
                         config.data.tasks = tasks
-                        runner.run(f"{env}-{method}-{tasks}-{seed}", config)
+                        runner.run({f"{env}-{method}-{tasks}-{seed}": config})
 
 
 class Point(NamedTuple):

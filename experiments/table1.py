@@ -15,19 +15,23 @@ from milx.config import GIVEN
 
 flags.adopt_module_key_flags(tables)
 
-TABLE = Table(
-    "table1",
-    "push",
-    {
-        f"{method}-{given.replace('+', '-')}": Row(
-            method,
-            {"mil.given": given, "network.learned_loss": "linear" if method == "mil" and given != GIVEN[0] else None},
-        )
-        for given in GIVEN
-        for method in cells.METHODS["push"]
-    },
-    shots=(1, 5),
-)
+TEMPORAL = {"network.learned_loss": "temporal", "train.support_frames": None, "train.meta_batch": 16}
+"""The loss that convolves over time sees all frames, of fewer tasks."""
+
+
+def _rows() -> dict[str, Row]:
+    rows = {}
+    for given in GIVEN:
+        name = given.replace("+", "-")
+        for method in cells.METHODS["push"]:
+            learned = "linear" if method == "mil" and given != GIVEN[0] else None
+            rows[f"{method}-{name}"] = Row(method, {"mil.given": given, "network.learned_loss": learned})
+        if given != GIVEN[0]:
+            rows[f"mil-temporal-{name}"] = Row("mil", {"mil.given": given, **TEMPORAL})
+    return rows
+
+
+TABLE = Table("table1", "push", _rows(), shots=(1, 5))
 
 if __name__ == "__main__":
     app.run(lambda _: tables.make(TABLE))

@@ -25,13 +25,13 @@ class Table(NamedTuple):
     """A table of the paper.
 
     Attributes:
-        name: of its folder in results/.
+        folder: of its cells, in results/.
         env: the environment.
         rows: by name.
         shots: a column for each.
     """
 
-    name: str
+    folder: str
     env: str
     rows: dict[str, Row]
     shots: tuple[int, ...]
@@ -49,7 +49,7 @@ def configure(env: str, row: Row, shots: int, seed: int) -> Config:
 
 
 def make(table: Table) -> None:
-    """Runs what is missing and prints the table: means of the seeds, and in brackets by other criteria.
+    """Runs what is missing and prints a table for every criterion.
 
     Raises:
         ValueError: for a row that the table does not have; the message lists those that it has.
@@ -57,23 +57,47 @@ def make(table: Table) -> None:
     if unknown := sorted(set(_ROWS.value or ()) - set(table.rows)):
         raise ValueError(f"rows: got {unknown[0]!r}, expected some of {', '.join(table.rows)}")
     rows = {name: row for name, row in table.rows.items() if _ROWS.value is None or name in _ROWS.value}
-    folder, runners = options.folder(table.name), {}
-    for seed in range(options.SEEDS.value):
+    folder, runners = options.folder(table.folder), {}
+    seeds = range(options.SEEDS.value)
+    for seed in seeds:
         for name, row in rows.items():
-            for shots in table.shots:
-                config = configure(table.env, row, shots, seed)
-                runner = runners.setdefault(config.data.tasks, cells.Cells(folder, config.data.tasks))
-                runner.run(f"{name}-{shots}-{seed}", config)
-    results = cells.read(folder)
-    print("| | " + " | ".join(f"{shots}-shot" for shots in table.shots) + " |\n|---|" + "---|" * len(table.shots))
-    for name in rows:
-        shown = []
-        for shots in table.shots:
-            runs = [results[f"{name}-{shots}-{seed}"] for seed in range(options.SEEDS.value)]
-            others = [
-                statistics.mean(run["other_criteria"][criterion]["success"] for run in runs)
-                for criterion in runs[0].get("other_criteria", ())
-            ]
-            brackets = f" ({', '.join(f'{other:.1%}' for other in others)})" if others else ""
-            shown.append(f"{statistics.mean(run['success'] for run in runs):.1%}{brackets}")
-        print(f"| {name} | {' | '.join(shown)} |")
+            of_shots = {f"{name}-{shots}-{seed}": configure(table.env, row, shots, seed) for shots in table.shots}
+            tasks = configure(table.env, row, 1, seed).data.tasks
+            runners.setdefault(tasks, cells.Cells(folder, tasks)).run(of_shots)
+    found = cells.read(folder)
+    runs = {name: [[found[f"{name}-{shots}-{seed}"] for seed in seeds] for shots in table.shots] for name in rows}
+    print(markdown(runs, table.shots))
+
+
+def markdown(runs: dict[str, list[list[dict[str, Any]]]], shots: tuple[int, ...]) -> str:
+    """A table for every criterion: means of the seeds, their intervals, and what floors and expert reach beside them.
+
+    Args:
+        runs: result files of every row, by column and seed.
+        shots: the columns.
+    """
+    first = next(iter(runs.values()))[0][0]
+    lines = []
+    for criterion in (first["criterion"], *first.get("other_criteria", ())):
+        lines += [f"| {criterion} | " + " | ".join(f"{k}-shot" for k in shots) + " |", "|---|" + "---|" * len(shots)]
+        for name, columns in runs.items():
+            shown = [interval([judged(run, criterion) for run in seeds]) for seeds in columns]
+            lines.append(f"| {name} | {' | '.join(shown)} |")
+        floors = [[judged(run, criterion)["baselines"] for run in seeds] for seeds in next(iter(runs.values()))]
+        for name in ("random", "task_blind", "expert"):
+            shown = [f"{statistics.mean(run[name] for run in seeds):.1%}" for seeds in floors]
+            lines.append(f"| *{name.replace('_', '-')}* | {' | '.join(shown)} |")
+        lines.append("")
+    trials = sum(run["trials"] for run in next(iter(runs.values()))[0])
+    return "\n".join([*lines, f"{trials} trials in a field, of {len(next(iter(runs.values()))[0])} seeds."])
+
+
+def judged(run: dict[str, Any], criterion: str) -> dict[str, Any]:
+    """Success, interval and baselines of a result file by one of its criteria."""
+    return run if criterion == run["criterion"] else run["other_criteria"][criterion]
+
+
+def interval(runs: list[dict[str, Any]]) -> str:
+    """The mean over runs, and from where to where their 95% intervals reach."""
+    low, high = min(run["wilson95"][0] for run in runs), max(run["wilson95"][1] for run in runs)
+    return f"{statistics.mean(run['success'] for run in runs):.1%} ({low:.1%} to {high:.1%})"

@@ -36,6 +36,7 @@ def configure(env: str, method: str, candidate: str) -> Config:
     config = cells.configure(env, method, options.PRESET.value, seed=0, steps=options.STEPS.value or STEPS[env])
     config.optimizer.learning_rate, config.optimizer.cosine = CANDIDATES[candidate]
     config.train.eval_every = config.train.steps
+    config.train.redraw = env in ("push", "place")  # as in their tables
     return config
 
 

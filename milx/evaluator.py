@@ -12,13 +12,13 @@ import jax.numpy as jnp
 
 from milx import parallel
 from milx.chunks import map_in_chunks
-from milx.config import DataConfig, EvalConfig
+from milx.config import Config, DataConfig, EvalConfig
 from milx.data.demos import DemoSet, render_demo, shapes
 from milx.envs.base import Env, State, Task
 from milx.methods.base import Method
 from milx.methods.random import Random
 from milx.rollout import rollout
-from milx.trajopt.expert import perform
+from milx.trajopt.expert import judge, perform
 from milx.trajopt.ilqr import Options
 from milx.types import Params
 
@@ -102,8 +102,20 @@ def precompile(env: Env, method: Method, params: Params, config: EvalConfig) -> 
     _run_batch.lower(env, method, params, batch.task, batch.states, batch.action, scene, keys).compile()
 
 
-def baselines(env: Env, demos: DemoSet, config: EvalConfig, expert: DataConfig, key: jax.Array) -> dict[str, float]:
-    """Success rates of random actions, the task-blind expert, and the expert.
+class Floors(NamedTuple):
+    """Success rates of "random" actions, the "task_blind" expert, and the "expert".
+
+    Attributes:
+        success: by name.
+        other: the same by the environment's other criteria.
+    """
+
+    success: dict[str, float]
+    other: dict[str, dict[str, float]]
+
+
+def baselines(env: Env, demos: DemoSet, config: EvalConfig, expert: DataConfig, key: jax.Array) -> Floors:
+    """What random actions, the task-blind expert and the expert reach in the same trials.
 
     They run in the first `config.baseline_trials` of every task's trials. The task-blind expert goes to a random
     candidate; the expert runs its plan without noise.
@@ -120,10 +132,19 @@ def baselines(env: Env, demos: DemoSet, config: EvalConfig, expert: DataConfig, 
     twice = [jax.tree.map(lambda *xs: jnp.concatenate(xs), *pair) for pair in (believed, (scene, scene), (keys, keys))]
     options = Options(iterations=expert.plan_iterations)
     states, _ = map_in_chunks(lambda *chunk: perform(env, *chunk, options, 0.0), tuple(twice), expert.plan_batch)
-    both = jax.tree.map(lambda x: x.reshape(2, total, *x.shape[1:]), states)
-    task_blind, informed = jax.jit(jax.vmap(jax.vmap(env.success), in_axes=(None, 0)))(task, both).mean(axis=1)
-    random = run_trials(env, Random(env.action_size), (), demos, config, key).success[:, :num_trials]
-    return {"random": float(random.mean()), "task_blind": float(task_blind), "expert": float(informed)}
+    as_it_is = jax.tree.map(lambda x: jnp.concatenate([x, x]), task)
+    success, other = map_in_chunks(functools.partial(judge, env), (as_it_is, states), expert.plan_batch)
+    random = run_trials(env, Random(env.action_size), (), demos, config, key)
+
+    def rates(of_experts: jax.Array, of_random: jax.Array) -> dict[str, float]:
+        halves = of_experts.reshape(2, total).mean(axis=1)
+        return {
+            "random": float(of_random[:, :num_trials].mean()),
+            "task_blind": float(halves[0]),
+            "expert": float(halves[1]),
+        }
+
+    return Floors(rates(success, random.success), {name: rates(other[name], random.other[name]) for name in other})
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -135,13 +156,19 @@ def film(camera: Env, task: Task, states: State) -> jax.Array:
     return jax.vmap(camera.film)(task, states)
 
 
-def summary(trials: Trials) -> dict[str, Any]:
-    """Number of trials, success rate and its interval; the same by other criteria, if there are."""
-    others = {name: _rate(success) for name, success in trials.other.items()}
+def describe(env: Env, config: Config, trials: Trials, floors: Floors) -> dict[str, Any]:
+    """What the result file of a run says of its evaluation: what was asked and what came out, by every criterion."""
+    other = {name: {**_rate(success), "baselines": floors.other[name]} for name, success in trials.other.items()}
     return {
+        "num_tasks_train": config.data.tasks,
+        "num_demos_train": config.data.tasks * config.data.demos_per_task,
+        "shots": config.evaluation.shots,
+        "given": config.mil.given if env.vision else config.mil.given.removeprefix("video+"),
         "trials": int(trials.success.size),
         **_rate(trials.success),
-        **({"other_criteria": others} if others else {}),
+        "criterion": env.criterion,
+        "baselines": floors.success,
+        **({"other_criteria": other} if other else {}),
     }
 
 

@@ -78,7 +78,7 @@ class Place(Env):
     angular velocity in the world's axes, in [-1, 1] for MAX_SPEED and MAX_TURN; damped least squares (Wampler 1986)
     turn them into velocities of the joints, which stop at their limits. After the last action the hand opens.
 
-    The image is the paper's: a view of 320x240 pixels, halved and cropped in the middle.
+    The image covers the middle 200x180 pixels of the paper's view of 320x240, halved: its rays are drawn, no others.
     """
 
     name = "place"

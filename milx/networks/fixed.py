@@ -61,14 +61,17 @@ def load(path: str, config: NetworkConfig) -> Filters:
 
 
 def _read(file: pathlib.Path) -> dict[str, np.ndarray]:
-    if file.suffix == ".npz":
-        with np.load(file, allow_pickle=False) as arrays:
-            return dict(arrays)
     try:
+        if file.suffix == ".npz":
+            with np.load(file, allow_pickle=False) as arrays:
+                return dict(arrays)
         from safetensors.numpy import load_file
+
+        return load_file(file)
     except ImportError as error:
         raise ValueError(f"network.fixed_filters: {file} needs the package safetensors; pip install it") from error
-    return load_file(file)
+    except Exception as error:  # safetensors and zipfile have many
+        raise ValueError(f"network.fixed_filters: {file} cannot be read: {error}") from error
 
 
 def cluster(images: np.ndarray, config: NetworkConfig) -> Filters:

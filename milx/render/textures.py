@@ -100,7 +100,7 @@ def _draw_turn(key: jax.Array) -> jax.Array:
 
 
 def draw(key: jax.Array, split: str) -> Textures:
-    """A texture of one of the split's families, of any size, turn, shift and colour."""
+    """A texture of one of the families of a split (a key of SPLITS), of any size, turn, shift and colour."""
     names = list(FAMILIES)
     family_key, turn_key, period_key, shift_key, color_key = jax.random.split(key, 5)
     family = jax.random.choice(family_key, jnp.array([names.index(name) for name in SPLITS[split]]))

@@ -75,3 +75,13 @@ def perform(
         return demonstrate(env, task, state, expert, key, noise)
 
     return parallel.split_tasks(jax.vmap(one, in_axes=(None, 0, 0, 0)), shared=1)(noise, task, state, key)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def judge(env: Env, task: Task, states: State) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """Success of a batch of episodes, and success by the environment's other criteria; all have a leading axis."""
+
+    def one(task: Task, states: State) -> tuple[jax.Array, dict[str, jax.Array]]:
+        return env.success(task, states), env.other_criteria(task, states)
+
+    return parallel.split_tasks(jax.vmap(one))(task, states)

@@ -15,30 +15,31 @@ def test_a_cell_is_a_run(trained, tmp_path, monkeypatch):
     """The same seeds, tasks and trials: the same success, demonstrations and baselines, to the last bit."""
     monkeypatch.setattr(cells.envs, "make", lambda *_: trained.run.env)  # spares what is compiled for it
     runner, config = cells.Cells(tmp_path, trained.config.data.tasks), tiny_config()
-    runner.run("cell", config)
+    runner.run({"cell": config})
     result = cells.read(tmp_path)["cell"]
     for field in ("success", "trials", "wilson95", "baselines", "dataset_hash"):
         assert result[field] == trained.result[field], field
     assert result["validation_success"] == max(line.get("validation_success", 0) for line in trained.metrics)
 
     before = (tmp_path / "cell.json").stat().st_mtime_ns
+    config.evaluation.batch, config.data.plan_batch = 7, 7  # how much runs at once is no part of a cell
     assert runner.is_done("cell", config)
-    runner.run("cell", config)
+    runner.run({"cell": config})
     assert (tmp_path / "cell.json").stat().st_mtime_ns == before
 
     config.optimizer.learning_rate = 0.5
     with pytest.raises(ValueError, match=r"cell.json: holds another cell: optimizer.learning_rate was 0.002, now 0.5"):
-        runner.run("cell", config)
+        runner.run({"cell": config})
 
 
 def test_bad_cells_are_refused_before_anything_is_planned(tmp_path):
     runner, config = cells.Cells(tmp_path, 8), tiny_config()
     config.data.tasks = 3
     with pytest.raises(ValueError, match=r"data\.tasks: got 3, expected a divisor of 8"):
-        runner.run("cell", config)
+        runner.run({"cell": config})
     config = dataclasses.replace(tiny_config(), train=dataclasses.replace(tiny_config().train, eval_every=3))
     with pytest.raises(ValueError, match=r"train\.eval_every: got 3, expected a positive multiple"):
-        runner.run("cell", config)
+        runner.run({"cell": config})
     assert not list(tmp_path.iterdir())
 
 

@@ -29,7 +29,7 @@ def test_a_point_is_the_mean_of_its_seeds_within_all_their_intervals():
     assert curves["reach", "lstm"][500] == pytest.approx((0.1, 0.0, 0.2, 1))
 
 
-@pytest.mark.parametrize("table", [table1.TABLE, table2.TABLE, table3.TABLE], ids=lambda table: table.name)
+@pytest.mark.parametrize("table", [table1.TABLE, table2.TABLE, table3.TABLE], ids=["table1", "table2", "table3"])
 def test_rows_are_trained_once_for_all_shots_and_each_on_its_own(table, tmp_path, flags):
     spec, runner, programs = spec_of(envs.make(table.env, (48, 48))), cells.Cells(tmp_path, 1), set()
     for row in table.rows.values():
@@ -43,8 +43,25 @@ def test_rows_are_trained_once_for_all_shots_and_each_on_its_own(table, tmp_path
 
 def test_an_unknown_row_is_refused(flags):
     flags.rows = ["two-haeds"]
-    with pytest.raises(ValueError, match="rows: got 'two-haeds', expected some of one-head, two-heads"):
+    with pytest.raises(ValueError, match="rows: got 'two-haeds', expected some of mil-video-state-action, two-heads"):
         tables.make(table2.TABLE)
+
+
+def test_a_table_shows_means_intervals_floors_and_every_criterion():
+    def run(success, low, high, near):
+        floors = {"random": 0.1, "task_blind": 0.25, "expert": 0.9}
+        other = {"success": near, "wilson95": [near - 0.1, near + 0.1], "baselines": floors | {"random": 0.3}}
+        mine = {"success": success, "wilson95": [low, high], "baselines": floors, "trials": 50}
+        return mine | {"criterion": "on it", "other_criteria": {"near it": other}}
+
+    text = tables.markdown({"one": [[run(0.5, 0.4, 0.6, 0.7), run(0.7, 0.65, 0.75, 0.8)]]}, (1,))
+    lines = text.splitlines()
+    assert lines[0] == "| on it | 1-shot |"
+    assert lines[2] == "| one | 60.0% (40.0% to 75.0%) |"
+    assert lines[3:6] == ["| *random* | 10.0% |", "| *task-blind* | 25.0% |", "| *expert* | 90.0% |"]
+    assert lines[7] == "| near it | 1-shot |"
+    assert lines[9:11] == ["| one | 75.0% (60.0% to 90.0%) |", "| *random* | 30.0% |"]
+    assert lines[-1] == "100 trials in a field, of 2 seeds."
 
 
 @pytest.fixture
