@@ -10,7 +10,7 @@ import pathlib
 from milx import envs, launch
 from milx.config import Config
 from milx.data import demos as demos_lib
-from milx.run import split_demos
+from milx.simulation import split_demos
 
 
 def main(config: Config, workdir: str) -> None:

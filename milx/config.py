@@ -48,6 +48,23 @@ class DataConfig:
 
 
 @dataclasses.dataclass
+class RecordedConfig:
+    """Recorded demonstrations, instead of an environment (`milx.data.dataset`).
+
+    Attributes:
+        path: the data set's folder.
+        horizon: time steps that every demonstration is resampled to.
+        goal_indices: entries of the state that tell where the robot is: a goal head predicts where they end.
+        gib: room on the device for what a scan draws its batches from, in GiB; the next scan's is loaded meanwhile.
+    """
+
+    path: str = ""
+    horizon: int = 50
+    goal_indices: tuple[int, ...] = ()
+    gib: float = 2.0
+
+
+@dataclasses.dataclass
 class NetworkConfig:
     """The policy network.
 
@@ -193,6 +210,7 @@ class Config:
     seed: int = 0
     env: EnvConfig = dataclasses.field(default_factory=EnvConfig)
     data: DataConfig = dataclasses.field(default_factory=DataConfig)
+    recorded: RecordedConfig = dataclasses.field(default_factory=RecordedConfig)
     network: NetworkConfig = dataclasses.field(default_factory=NetworkConfig)
     mil: MILConfig = dataclasses.field(default_factory=MILConfig)
     optimizer: OptimizerConfig = dataclasses.field(default_factory=OptimizerConfig)
@@ -355,6 +373,22 @@ def _place_cpu() -> Config:
     return config
 
 
+def _recorded_fast() -> Config:
+    config = _push_fast()
+    config.train.steps, config.train.eval_every, config.train.redraw = 10_000, 1000, False
+    return config
+
+
+def _recorded_cpu() -> Config:
+    config = _recorded_fast()
+    config.network.mixed_precision = False
+    config.network.filters, config.network.kernel, config.network.strides = (16,) * 4, 3, (2, 2, 2, 1)
+    config.network.fc_layers = (100, 100, 100)
+    config.train.steps, config.train.meta_batch = 2000, 4
+    config.train.log_every, config.train.eval_every = 50, 500
+    return config
+
+
 def _without_pixels(config: Config) -> Config:
     """No convolutions, but all time steps, which cost little now."""
     network = config.network
@@ -369,6 +403,7 @@ PRESETS: dict[str, dict[str, Callable[[], Config]]] = {
     "push": {"paper": _push_paper, "fast": _push_fast, "cpu": _push_cpu},
     "place": {"paper": _place_paper, "fast": _place_fast, "cpu": _place_cpu},
     "reach_state": {"fast": _reach_state_fast, "cpu": _reach_state_cpu},
+    "recorded": {"fast": _recorded_fast, "cpu": _recorded_cpu},
 }
 """Preset factories by environment and name."""
 

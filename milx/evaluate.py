@@ -12,7 +12,7 @@ import sys
 from absl import app, flags, logging
 
 from milx import config as config_lib
-from milx.run import Run
+from milx import runs
 
 _WORKDIR = flags.DEFINE_string("workdir", None, "Folder of the run.", required=True)
 
@@ -26,7 +26,7 @@ def main(argv: list[str]) -> None:
     if not path.is_file():
         sys.exit(f"milx: workdir: {path.parent} has no config.json, expected a folder of `python -m milx.train`")
     try:
-        run = Run(config_lib.from_dict(json.loads(path.read_text())), path.parent)
+        run = runs.make(config_lib.from_dict(json.loads(path.read_text())), path.parent)
         run.report(run.evaluate())
     except ValueError as error:
         sys.exit(f"milx: {error}")

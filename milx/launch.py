@@ -1,5 +1,6 @@
 """What the launchers share: flags that everybody sets, and overrides of single configuration fields."""
 
+import pathlib
 import sys
 from collections.abc import Callable, Sequence
 
@@ -8,7 +9,7 @@ from absl import app, flags, logging
 from ml_collections import config_flags
 
 from milx import config as config_lib
-from milx import parallel
+from milx import parallel, recording
 from milx.config import PRESETS, Config
 from milx.envs import ENVS
 from milx.methods import METHODS
@@ -21,6 +22,7 @@ flags.disclaim_key_flags()  # so that --help of a launcher lists the flags defin
 def define_flags() -> None:
     """Defines --env, --method, --preset, --seed, --workdir and what several hosts need."""
     flags.DEFINE_string("env", "reach", f"Environment: {', '.join(ENVS)}.")
+    flags.DEFINE_string("data", None, "Folder of recorded demonstrations (milx.data), instead of an environment.")
     flags.DEFINE_string("method", "mil", f"Method: {', '.join(METHODS)}.")
     flags.DEFINE_string(
         "preset",
@@ -55,7 +57,8 @@ def run(main: Callable[[Config, str], None]) -> None:
         if FLAGS.preset is None:
             others = ", ".join(f"--preset={name}" for name in PRESETS[config.env_name] if name != config.preset)
             print(f"Running on {jax.default_backend()} with its default, --preset={config.preset}; also: {others}.")
-        name = f"{config.env_name}-{config.method_name}-{config.preset}-{config.seed}"
+        what = config.env_name if FLAGS.data is None else pathlib.Path(FLAGS.data).resolve().name
+        name = f"{what}-{config.method_name}-{config.preset}-{config.seed}"
         try:
             main(config, FLAGS.workdir or f"runs/{name}")
         except ValueError as error:
@@ -71,7 +74,10 @@ def _parse(argv: Sequence[str]) -> list[str]:
     parallel.join_hosts(FLAGS.coordinator, FLAGS.num_processes, FLAGS.process_id)
     preset = FLAGS.preset or ("cpu" if jax.default_backend() == "cpu" else "fast")
     try:
-        config = config_lib.make_config(FLAGS.env, FLAGS.method, preset, FLAGS.seed)
+        if FLAGS.data is None:
+            config = config_lib.make_config(FLAGS.env, FLAGS.method, preset, FLAGS.seed)
+        else:
+            config = recording.make_config(FLAGS.data, FLAGS.method, preset, FLAGS.seed)
     except ValueError as error:
         raise flags.Error(str(error)) from error
     _check_fields(argv, config)

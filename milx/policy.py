@@ -18,6 +18,9 @@ from milx.methods import Method, Spec
 from milx.types import Demo, Observation, Params
 from milx.whitening import Whitening
 
+SPEC_FILE = "spec.json"
+"""In the folder of a run on recorded demonstrations: the sizes that an environment tells otherwise."""
+
 
 def spec_of(env: envs.Env) -> Spec:
     """The sizes of what a policy sees and does in an environment."""
@@ -97,7 +100,10 @@ def load(run: str | pathlib.Path) -> Policy:
     if not path.is_file():
         raise ValueError(f"run: {folder} has no config.json, expected a folder written by `python -m milx.train`")
     config = config_lib.from_dict(json.loads(path.read_text()))
-    spec = spec_of(envs.make(config.env_name, config.env.image_shape))
+    if (folder / SPEC_FILE).is_file():
+        spec = Spec.from_dict(json.loads((folder / SPEC_FILE).read_text()))
+    else:
+        spec = spec_of(envs.make(config.env_name, config.env.image_shape))
     method = methods.make(config, spec)
     checkpoints = Checkpoints(folder / "checkpoints", read_only=True)
     if checkpoints.best is None:
@@ -137,14 +143,21 @@ def check_demo(demo: Demo, spec: Spec, given: str = GIVEN[0]) -> Demo:
         checked = dataclasses.replace(checked, action=_check_action(demo.action, shape, spec))
     if not lead:
         checked = jax.tree.map(lambda x: x[None], checked)
-    if checked.state is None:
-        return checked
-    goal = jax.vmap(lambda state: goals(state, spec.goal_indices, spec.height_index))(checked.state)
-    return dataclasses.replace(checked, goal=goal)
+    return with_goals(checked, spec)
+
+
+def with_goals(demo: Demo, spec: Spec) -> Demo:
+    """Demonstrations [K, T, ...] with their goals, if their states tell them."""
+    if demo.state is None or not spec.goal_indices:
+        return demo
+    goal = jax.vmap(lambda state: goals(state, spec.goal_indices, spec.height_index))(demo.state)
+    return dataclasses.replace(demo, goal=goal)
 
 
 def _check_action(value: Any, shape: tuple[int, ...], spec: Spec) -> np.ndarray:
     action = _check_vector("demo.action", value, (*shape, spec.action_size))
+    if spec.action_range is None:
+        return action
     low, high = spec.action_range
     if outside := np.argwhere((action < low) | (action > high)).tolist():
         index = tuple(outside[0])

@@ -46,6 +46,28 @@ def learning_curve(metrics: list[dict[str, Any]], evaluation: dict[str, Any], pa
     figure.savefig(path, dpi=120)
 
 
+def action_errors(metrics: list[dict[str, Any]], evaluation: dict[str, Any], path: pathlib.Path) -> None:
+    """Plots the meta-objective and the validation score, and the errors of the actions on test tasks.
+
+    Args:
+        metrics: lines with "step" and "action_loss", or "validation_score".
+        evaluation: the run's evaluation.json.
+        path: image file to write.
+    """
+    figure = Figure(figsize=(10, 3.6), layout="constrained")
+    left, middle, right = figure.subplots(1, 3)
+    for axis, name, title in ((left, "action_loss", "after adaptation"), (middle, "validation_score", "validation")):
+        values = [(line["step"], line[name]) for line in metrics if name in line]
+        axis.plot(*zip(*values, strict=True), "-o" if axis is middle else "-", lw=1)
+        axis.set(xlabel="meta-updates", ylabel=name.replace("_", " "), title=title)
+    errors = evaluation["action_error"]
+    names = [name for name in ("mean_action", "before", "other_task", "after") if name in errors]
+    bars = right.bar([name.replace("_", "\n") for name in names], [errors[name] for name in names], color="0.7")
+    bars[-1].set_color("tab:blue")
+    right.set(title=f"test, {errors['tasks']} tasks", ylabel="squared error of the actions")
+    figure.savefig(path, dpi=120)
+
+
 def side_by_side(demo: np.ndarray, trial: np.ndarray, path: pathlib.Path, fps: int = 20) -> None:
     """Writes an animation: the demonstration on the left, the policy on the right.
 

@@ -1,4 +1,4 @@
-"""Result files: one JSON object for a run, the same for all experiments."""
+"""Result files: one JSON object for a run or a cell, with the same fields in all experiments."""
 
 import json
 import pathlib
@@ -7,25 +7,16 @@ from typing import Any
 from milx import config as config_lib
 from milx import provenance
 from milx.config import Config
-from milx.envs.base import Env
 
 
 def describe(
-    config: Config,
-    env: Env,
-    summary: dict[str, Any],
-    floors: dict[str, float],
-    seconds: dict[str, float],
-    step: int,
-    dataset_hash: str,
+    config: Config, found: dict[str, Any], seconds: dict[str, float], step: int, dataset_hash: str
 ) -> dict[str, Any]:
     """A result as its JSON file holds it: what was run, what came out, what it took, and where.
 
     Args:
         config: what was run.
-        env: its environment.
-        summary: trials, success and wilson95.
-        floors: success rates of the baselines in the same trials.
+        found: what the evaluation says (`evaluator.describe`).
         seconds: wall-clock by part.
         step: meta-updates of the checkpoint that was evaluated.
         dataset_hash: `fingerprint` of the training demonstrations.
@@ -36,13 +27,7 @@ def describe(
         "preset": config.preset,
         "variant": ", ".join(f"{name}={value}" for name, value in config_lib.overrides(config).items()),
         "seed": config.seed,
-        "num_tasks_train": config.data.tasks,
-        "num_demos_train": config.data.tasks * config.data.demos_per_task,
-        "shots": config.evaluation.shots,
-        "given": config.mil.given if env.vision else config.mil.given.removeprefix("video+"),
-        **summary,
-        "criterion": env.criterion,
-        "baselines": floors,
+        **found,
         "wall_clock_s": seconds,
         "steps": step,
         "config": config_lib.to_dict(config),

@@ -6,14 +6,13 @@ Run it again with the same flags and it continues where it stopped.
     python -m milx.train --env=reach --preset=paper --seed=1 --config.train.meta_batch=25
 """
 
-from milx import launch
+from milx import launch, runs
 from milx.config import Config
-from milx.run import Run
 
 
 def main(config: Config, workdir: str) -> None:
     """Trains and evaluates."""
-    run = Run(config, workdir)
+    run = runs.make(config, workdir)
     run.train()
     run.report(run.evaluate())
 

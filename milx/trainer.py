@@ -6,6 +6,7 @@ and the step, so a run that is stopped and started again repeats the uninterrupt
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -14,11 +15,12 @@ import optax
 
 from milx import parallel
 from milx.config import OptimizerConfig, TrainConfig
-from milx.data.demos import DemoSet, sample_batch
-from milx.envs.base import Env
 from milx.methods.base import Method
 from milx.types import Array, Params, TaskBatch
 from milx.whitening import Whitening
+
+Sample = Callable[[Any, jax.Array], TaskBatch]
+"""Draws a batch from demonstrations, a task for each of the keys [N]; called inside `jax.jit`."""
 
 _CPU_IMAGES = 100
 """Images of a meta-batch that a CPU works on at once; at least one task's. With 500 of 80x64 each takes longer."""
@@ -80,13 +82,13 @@ class Trainer:
     """The meta-training loop's jitted part.
 
     Attributes:
-        env: renders the demonstrations.
+        sample: draws batches from what `run` is given as `data`.
         method: what learns.
         train: batch sizes and length.
         optimizer: the meta-optimizer.
     """
 
-    env: Env
+    sample: Sample
     method: Method
     train: TrainConfig
     optimizer: optax.GradientTransformation
@@ -97,26 +99,21 @@ class Trainer:
         params = self.method.init(key, whitening)
         return TrainState(jnp.zeros((), jnp.int32), params, self.optimizer.init(params))
 
-    def update(self, state: TrainState, demos: DemoSet, key: jax.Array) -> tuple[TrainState, dict[str, jax.Array]]:
+    def update(self, state: TrainState, data: Any, key: jax.Array) -> tuple[TrainState, dict[str, jax.Array]]:
         """One meta-update on the batch of (key, state.step)."""
 
-        def gradient(params: Params, demos: DemoSet, keys: jax.Array) -> tuple[Params, dict[str, jax.Array]]:
-            train = self.train
-            frames = train.support_frames, train.query_frames
-            batch = sample_batch(self.env, demos, keys, train.shots, *frames, train.redraw)
-            return meta_gradient(self.method, params, batch)
+        def gradient(params: Params, data: Any, keys: jax.Array) -> tuple[Params, dict[str, jax.Array]]:
+            return meta_gradient(self.method, params, self.sample(data, keys))
 
         keys = jax.random.split(jax.random.fold_in(key, state.step), self.train.meta_batch)
-        grad, metrics = parallel.split_tasks(gradient, shared=2, average=True)(state.params, demos, keys)
+        grad, metrics = parallel.split_tasks(gradient, shared=2, average=True)(state.params, data, keys)
         updates, optimizer = self.optimizer.update(grad, state.optimizer, state.params)
         params = optax.apply_updates(state.params, updates)
         metrics["grad_norm"] = optax.global_norm(grad)
         return TrainState(state.step + 1, params, optimizer), metrics
 
     @functools.partial(jax.jit, static_argnums=(0, 4))
-    def run(
-        self, state: TrainState, demos: DemoSet, key: jax.Array, steps: int
-    ) -> tuple[TrainState, dict[str, jax.Array]]:
+    def run(self, state: TrainState, data: Any, key: jax.Array, steps: int) -> tuple[TrainState, dict[str, jax.Array]]:
         """Runs `steps` meta-updates in one scan; returns the state and the metrics' means."""
-        state, metrics = jax.lax.scan(lambda s, _: self.update(s, demos, key), state, length=steps)
+        state, metrics = jax.lax.scan(lambda s, _: self.update(s, data, key), state, length=steps)
         return state, jax.tree.map(jnp.mean, metrics)

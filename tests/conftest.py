@@ -9,17 +9,18 @@ from typing import Any
 import jax
 import pytest
 from tiny import QUIET, tiny_config
+from xdist.scheduler import LoadScopeScheduling
 
 from milx.config import Config
 from milx.data.demos import DemoSet
-from milx.run import Run
+from milx.simulation import SimulatedRun
 
 
 @dataclasses.dataclass(frozen=True)
 class Trained:
     """A finished run, and the demonstrations that it used."""
 
-    run: Run
+    run: SimulatedRun
     result: dict[str, Any]
     train: DemoSet
     validation: DemoSet
@@ -38,9 +39,27 @@ class Trained:
         return [json.loads(line) for line in (self.folder / "metrics.jsonl").read_text().splitlines()]
 
 
+FIRST = ("test_run.py", "test_parallel.py", "test_cells.py", "test_demos.py", "test_evaluator.py", "test_policy.py")
+"""The files that take longest, so that in the end no process is left alone with one of them."""
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The files that take longest first, so that in the end no process is left alone with one of them."""
-    items.sort(key=lambda item: item.path.name not in ("test_parallel.py", "test_notebook.py"))
+    """Puts FIRST first."""
+    items.sort(key=lambda item: FIRST.index(item.path.name) if item.path.name in FIRST else len(FIRST))
+
+
+class Scheduling(LoadScopeScheduling):
+    """A file's tests run in one process, and all files that look at the tiny run in the same one."""
+
+    def _split_scope(self, nodeid: str) -> str:
+        file = nodeid.split("::")[0]
+        looks = pathlib.Path(file).name in FIRST and not file.endswith("test_parallel.py")
+        return "the tiny run" if looks else file
+
+
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Scheduling:
+    """Called by xdist where there are several processes."""
+    return Scheduling(config, log)
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -58,7 +77,7 @@ def cache(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def trained(cache, tmp_path_factory) -> Trained:
-    run = Run(tiny_config(), tmp_path_factory.mktemp("run"), QUIET)
+    run = SimulatedRun(tiny_config(), tmp_path_factory.mktemp("run"), QUIET)
     run.train()
     result = run.evaluate()
     return Trained(run, result, *(run.demos(split) for split in ("train", "validation", "test")))

@@ -1,15 +1,16 @@
 """Wilson's interval, which scenes are tried, and that the size of a batch changes nothing."""
 
 import dataclasses
+import types
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
+from tiny import tiny_config
 
-from milx import evaluator
-from milx import run as run_lib
+from milx import evaluator, simulation
 from milx.chunks import map_in_chunks
 from milx.config import EvalConfig
 from milx.methods import Method
@@ -37,12 +38,16 @@ def test_wilson_interval_against_scipy(trials):
         assert 0 <= low <= successes / trials <= high <= 1
 
 
-def test_summary_counts_trials():
+def test_a_result_counts_trials_by_every_criterion_and_has_floors_beside_each():
     table = jnp.array([[True, False, True], [False, False, True]])
-    found = evaluator.summary(evaluator.Trials(table, {"nearly": ~table | table}, ()))
-    assert (found["trials"], found["success"]) == (6, 0.5)
+    floors = evaluator.Floors({"random": 0.1}, {"nearly": {"random": 0.2}})
+    env = types.SimpleNamespace(vision=True, criterion="exactly")
+    trials = evaluator.Trials(table, {"nearly": ~table | table}, ())
+    found = evaluator.describe(env, tiny_config(), trials, floors)
+    assert (found["trials"], found["success"], found["baselines"]) == (6, 0.5, {"random": 0.1})
     assert found["wilson95"] == list(evaluator.wilson_interval(3, 6))
-    assert found["other_criteria"]["nearly"] == {"success": 1.0, "wilson95": list(evaluator.wilson_interval(6, 6))}
+    other = {"success": 1.0, "wilson95": list(evaluator.wilson_interval(6, 6)), "baselines": {"random": 0.2}}
+    assert found["other_criteria"]["nearly"] == other
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -84,7 +89,7 @@ def test_no_trial_takes_place_in_the_demonstration_s_scene(trained, split, monke
         evaluator, "_run_batch", lambda env, method, params, task, states, action, scene, key: (scene, states, action)
     )
     config = dataclasses.replace(trained.config.evaluation, trials=10)
-    key = run_lib.trial_key(split)
+    key = simulation.trial_key(split)
     scene, states, action = evaluator.run_trials(trained.run.env, trained.run.method, (), demos, config, key)
     np.testing.assert_array_equal(action, demos.action[:, :1])
     cubes, shown = np.asarray(scene.mocap_pos), np.asarray(states.mocap_pos[:, :, 0])
@@ -99,7 +104,7 @@ def test_no_trial_takes_place_in_the_demonstration_s_scene(trained, split, monke
 
 @pytest.mark.parametrize(("trials", "asked", "tried"), [(3, 1, 1), (2, 2, 2), (2, 10, 2)])
 def test_baselines_run_in_the_first_trials(trained, monkeypatch, trials, asked, tried):
-    env, key = trained.run.env, run_lib.trial_key("test")
+    env, key = trained.run.env, simulation.trial_key("test")
     config = dataclasses.replace(trained.config.evaluation, trials=trials, baseline_trials=asked)
     asked_for = {}
 
@@ -110,7 +115,7 @@ def test_baselines_run_in_the_first_trials(trained, monkeypatch, trials, asked, 
 
     monkeypatch.setattr(evaluator, "perform", watch)
     plans = dataclasses.replace(trained.config.data, plan_batch=2 * 3 * tried)
-    rates = evaluator.baselines(env, trained.test, config, plans, key)
+    rates = evaluator.baselines(env, trained.test, config, plans, key).success
     scene = evaluator.trial_scenes(env, trained.test.task, jax.random.split(key)[0], trials)
     expected = jax.tree.map(lambda x: x[:, :tried].reshape(-1, *x.shape[2:]), scene)
     twice = jax.tree.map(lambda x: jnp.concatenate([x, x]), expected)
@@ -138,7 +143,7 @@ def test_programs_compiled_ahead_are_found(trained, caplog):
 
 def test_validation_and_test_trials_differ(trained):
     scenes = [
-        evaluator.trial_scenes(trained.run.env, trained.test.task, run_lib.trial_key(split), 4).mocap_pos
+        evaluator.trial_scenes(trained.run.env, trained.test.task, simulation.trial_key(split), 4).mocap_pos
         for split in ("validation", "test")
     ]
     assert np.abs(scenes[0] - scenes[1]).max(axis=(-2, -1)).min() > 0.01

@@ -19,7 +19,8 @@ from milx.data import demos as demos_lib
 from milx.metrics import MetricsWriter
 from milx.networks import fixed
 from milx.policy import params_like, spec_of
-from milx.run import Run, initial_state
+from milx.run import initial_state
+from milx.simulation import SimulatedRun, training_on
 
 RESULT_FIELDS = {
     *("env", "method", "preset", "variant", "seed", "num_tasks_train", "num_demos_train", "shots", "given"),
@@ -49,7 +50,7 @@ class StoppedError(Exception):
 
 def same_run(trained, folder):
     """A new run of the same configuration; it borrows the compiled programs."""
-    run = Run(tiny_config(), folder, QUIET)
+    run = SimulatedRun(tiny_config(), folder, QUIET)
     run.env, run.method, run.trainer = trained.run.env, trained.run.method, trained.run.trainer
     return run
 
@@ -107,9 +108,9 @@ def test_a_fixed_first_layer_is_made_from_what_the_training_demonstrations_show_
     config = tiny_config()
     config.network.fixed_filters = "kmeans"
     trainer = dataclasses.replace(trained.run.trainer, method=methods.make(config, spec_of(trained.run.env)))
-    state, _ = initial_state(trainer, config, trained.train)
+    state, _ = initial_state(trainer, config, training_on(trained.run.env, config, trained.train))
     first = jax.tree.map(lambda x: x[:, 0, 0], trained.train.states)
-    images = jax.jit(jax.vmap(trainer.env.render))(trained.train.task, first)
+    images = jax.jit(jax.vmap(trained.run.env.render))(trained.train.task, first)
     expected = fixed.cluster(np.asarray(images), config.network)
     layer = state.params["policy"]["vision"]["ConvBlock_0"]
     np.testing.assert_array_equal(layer["fixed_kernel"], expected.kernel)
@@ -128,7 +129,7 @@ def test_folder_of_another_configuration_is_refused(trained, group, field, value
     name = f"{group}.{field}" if group else field
     kept = (trained.folder / "config.json").read_text()
     with pytest.raises(ValueError, match=re.escape(f"{name} was {before}, now {value}")) as error:
-        Run(config, trained.folder, QUIET)
+        SimulatedRun(config, trained.folder, QUIET)
     assert str(trained.folder) in str(error.value)
     assert str(error.value).count(" was ") == 1
     assert (trained.folder / "config.json").read_text() == kept
@@ -136,7 +137,7 @@ def test_folder_of_another_configuration_is_refused(trained, group, field, value
 
 def test_run_without_a_checkpoint_cannot_be_evaluated(tmp_path):
     with pytest.raises(ValueError, match="no checkpoint yet"):
-        Run(tiny_config(), tmp_path, QUIET).evaluate()
+        SimulatedRun(tiny_config(), tmp_path, QUIET).evaluate()
 
 
 def test_metrics_hold_a_loss_and_a_validation_at_every_interval(trained):
@@ -153,7 +154,7 @@ def test_metrics_hold_a_loss_and_a_validation_at_every_interval(trained):
 
 def test_best_checkpoint_has_the_highest_validation_success(trained, tmp_path, monkeypatch):
     successes = iter([0.25, 0.75, 0.5])
-    monkeypatch.setattr(Run, "_validate", lambda *_: next(successes))
+    monkeypatch.setattr(SimulatedRun, "_validate", lambda *_: next(successes))
     run = same_run(trained, tmp_path)
     run.train()
     lines = [json.loads(line) for line in (tmp_path / "metrics.jsonl").open()]

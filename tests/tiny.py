@@ -7,12 +7,14 @@ from milx.config import Config, make_config
 QUIET = Console(quiet=True)
 
 
-def tiny_config(seed: int = 0) -> Config:
+def tiny_config(seed: int = 0, env: str = "reach") -> Config:
     """Sizes at which compiling takes far longer than running."""
-    config = make_config("reach", preset="cpu", seed=seed)
+    config = make_config(env, preset="cpu", seed=seed)
     config.data.tasks, config.data.demos_per_task = 8, 3
     config.data.plan_iterations, config.data.plan_batch = 8, 24
-    config.network.filters, config.network.strides, config.network.fc_layers = (4, 4), (2, 2), (16,)
+    config.network.fc_layers = (16,)
+    if env == "reach":
+        config.network.filters, config.network.strides = (4, 4), (2, 2)
     config.train.steps, config.train.log_every, config.train.eval_every = 6, 2, 2
     config.train.meta_batch, config.train.support_frames, config.train.query_frames = 2, 3, 3
     config.evaluation.validation_tasks, config.evaluation.tasks = 3, 3

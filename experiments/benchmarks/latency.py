@@ -18,6 +18,7 @@ from jax.experimental.compilation_cache import compilation_cache
 
 from milx import envs, evaluator, methods, platform
 from milx.config import Config, make_config
+from milx.data.demos import sampler
 from milx.envs.base import Env
 from milx.policy import Policy, spec_of
 from milx.trainer import Trainer, make_optimizer
@@ -67,7 +68,12 @@ def measure_planning(env: Env, report: common.Report) -> None:
 
 def measure_compilation(config: Config, env: Env, report: common.Report) -> None:
     """Rows of compiling the training scan: without a cache, and from it."""
-    trainer = Trainer(env, methods.make(config, spec_of(env)), config.train, make_optimizer(config.optimizer, 100))
+    trainer = Trainer(
+        sampler(env, config.train),
+        methods.make(config, spec_of(env)),
+        config.train,
+        make_optimizer(config.optimizer, 100),
+    )
     state, demos = trainer.init(jax.random.key(0), workload.unit_whitening(env)), workload.random_demos(env, 8, 4)
     with tempfile.TemporaryDirectory() as folder:
         jax.config.update("jax_compilation_cache_dir", folder)

@@ -9,7 +9,7 @@ from jax.sharding import NamedSharding, PartitionSpec
 
 from milx import methods, parallel, platform
 from milx.config import Config
-from milx.data.demos import DemoSet
+from milx.data.demos import DemoSet, sampler
 from milx.envs.base import Env, State
 from milx.policy import spec_of
 from milx.trainer import Trainer, make_optimizer
@@ -50,7 +50,12 @@ def random_demos(env: Env, num_tasks: int, num_demos: int) -> DemoSet:
 
 def measure_step(config: Config, env: Env) -> tuple[float, float]:
     """Median ms of a training step, rendering included, in a scan on the devices of the mesh; and GiB on each."""
-    trainer = Trainer(env, methods.make(config, spec_of(env)), config.train, make_optimizer(config.optimizer, 100))
+    trainer = Trainer(
+        sampler(env, config.train),
+        methods.make(config, spec_of(env)),
+        config.train,
+        make_optimizer(config.optimizer, 100),
+    )
     inputs = trainer.init(jax.random.key(0), unit_whitening(env)), random_demos(env, 64, 4), jax.random.key(1)
     inputs = jax.device_put(inputs, NamedSharding(parallel.mesh(), PartitionSpec()))
     steps = 20 if common.ACCELERATED else 2

@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 import pathlib
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -15,12 +16,15 @@ import numpy as np
 
 from milx import parallel
 from milx.chunks import map_in_chunks
-from milx.config import DataConfig
+from milx.config import DataConfig, TrainConfig
 from milx.envs.base import SPLITS, Env, State, Task
 from milx.goals import goals
-from milx.trajopt.expert import perform
+from milx.trajopt.expert import judge, perform
 from milx.trajopt.ilqr import Options
 from milx.types import Demo, TaskBatch
+
+SOURCES = ("envs/**/*.py", "envs/**/*.xml", "trajopt/*.py", "data/demos.py", "render/textures.py")
+"""The files of milx on which planned demonstrations depend."""
 
 
 @jax.tree_util.register_dataclass
@@ -67,7 +71,7 @@ def collect(env: Env, key: jax.Array, split: str, num_tasks: int, num_demos: int
     states, action = map_in_chunks(
         lambda *chunk: perform(env, *chunk, options, config.noise), tuple(inputs), config.plan_batch
     )
-    success = jax.jit(jax.vmap(env.success))(inputs[0], states)
+    success, _ = map_in_chunks(functools.partial(judge, env), (inputs[0], states), config.plan_batch)
     states, action, success = jax.tree.map(
         lambda x: x.reshape(num_tasks, num_demos, *x.shape[1:]), (states, action, success)
     )
@@ -161,6 +165,16 @@ def sample_batch(
     return jax.vmap(sample_task)(keys)
 
 
+def sampler(env: Env, train: TrainConfig) -> Callable[[DemoSet, jax.Array], TaskBatch]:
+    """`sample_batch` as a run has it configured: a function of demonstrations and keys."""
+
+    def sample(demos: DemoSet, keys: jax.Array) -> TaskBatch:
+        frames = train.support_frames, train.query_frames
+        return sample_batch(env, demos, keys, train.shots, *frames, train.redraw)
+
+    return sample
+
+
 def shapes(env: Env, num_tasks: int, num_demos: int) -> DemoSet:
     """Shapes and types of a set of D = `num_demos` demonstrations of each of N = `num_tasks` tasks."""
 
@@ -190,8 +204,7 @@ def cached(
     request = [env.name, seed, split, num_tasks, num_demos, config.noise, config.plan_iterations, jax.default_backend()]
     digest = hashlib.sha256(json.dumps([*request, jax.__version__, mujoco.__version__]).encode())
     root = pathlib.Path(__file__).parents[1]
-    patterns = ("envs/**/*.py", "envs/**/*.xml", "trajopt/*.py", "data/demos.py")
-    for source in sorted(path for pattern in patterns for path in root.glob(pattern)):
+    for source in sorted(path for pattern in SOURCES for path in root.glob(pattern)):
         digest.update(source.read_bytes())
     path = folder / f"{env.name}-{split}-{digest.hexdigest()[:16]}.npz"
     if parallel.on_all_hosts(path.is_file()):

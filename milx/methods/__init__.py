@@ -24,7 +24,7 @@ class Spec:
         image_shape: (H, W); None where the policy sees no pixels.
         state_size: S.
         action_size: A.
-        action_range: lowest and highest entry of each action.
+        action_range: lowest and highest entry of each action; None without limits.
         goal_indices: entries of the state that tell where the robot is heading (`milx.goals`).
         image_to_goal: [3][G] affine map from (x, y, 1), x and y in [-1, 1] across and down the image, to those entries,
             from the camera's calibration; None if that is not known.
@@ -35,11 +35,24 @@ class Spec:
     image_shape: tuple[int, int] | None
     state_size: int
     action_size: int
-    action_range: tuple[tuple[float, ...], tuple[float, ...]]
+    action_range: tuple[tuple[float, ...], tuple[float, ...]] | None
     goal_indices: tuple[int, ...]
     image_to_goal: tuple[tuple[float, ...], ...] | None = None
     object_indices: tuple[tuple[int, ...], ...] = ()
     height_index: int | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """As JSON can hold it."""
+        return dataclasses.asdict(self)
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> "Spec":
+        """The inverse of `to_dict`, also after a trip through JSON."""
+        return cls(**{name: _as_tuple(value) for name, value in values.items()})
+
+
+def _as_tuple(value: Any) -> Any:
+    return tuple(_as_tuple(each) for each in value) if isinstance(value, list) else value
 
 
 def _make_mil(config: Config, spec: Spec) -> Method:
@@ -94,6 +107,9 @@ def make(config: Config, spec: Spec) -> Method:
     if config.method_name not in METHODS:
         raise ValueError(f"method: got {config.method_name!r}, expected one of {', '.join(METHODS)}")
     _check_given(config, spec)
+    if config.network.fixed_filters is not None and spec.image_shape is None:
+        expected = "None: this policy sees no pixels"
+        raise ValueError(f"network.fixed_filters: got {config.network.fixed_filters!r}, expected {expected}")
     return METHODS[config.method_name](config, spec)
 
 

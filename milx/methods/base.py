@@ -26,6 +26,11 @@ class Method(abc.ABC):
     def adapt(self, params: Params, demo: Demo) -> Params:
         """Learns a task from demonstrations with axes [K, T, ...]; returns `task_params`."""
 
+    def unadapted(self, params: Params) -> Params | None:
+        """`task_params` before any demonstration; None for a method that cannot act without one."""
+        del params
+        return None
+
     @abc.abstractmethod
     def act(self, task_params: Params, observation: Observation, memory: Memory) -> tuple[jax.Array, Memory]:
         """Chooses the action [A], in the environment's units, for one observation; returns it and the next memory."""

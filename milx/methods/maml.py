@@ -30,9 +30,10 @@ from milx.whitening import Whitening
 def gradient(loss: Callable[..., jax.Array], theta: Params, *data: Any) -> Params:
     """The gradient of loss(theta, *data), once more differentiable in theta (in reverse); `data` counts as constant.
 
-    Its derivative is a product of the Hessian with a vector. As the Hessian is symmetric (so `loss` must not stop
-    gradients of theta), the product may be taken forward over reverse, which keeps no intermediate results of the inner
-    gradient for the meta-gradient (Pearlmutter 1994), where reverse over reverse keeps them all.
+    Its derivative is a product of the Hessian with a vector. As the Hessian is symmetric (`loss` must not stop the
+    gradient of a part of theta in one place and use it in another), the product may be taken forward over reverse,
+    which keeps no intermediate results of the inner gradient for the meta-gradient (Pearlmutter 1994), where reverse
+    over reverse keeps them all.
     """
     return jax.grad(loss)(theta, *data)
 
@@ -93,6 +94,10 @@ class MIL(Method):
                 grad = jax.lax.stop_gradient(grad)
             theta = jax.tree.map(lambda p, g, rate: p - rate * jnp.clip(g, -clip, clip), theta, grad, rates)
         return {"policy": theta, "whitening": params["whitening"]}
+
+    def unadapted(self, params: Params) -> Params:
+        """The parameters from which every task is learnt."""
+        return {"policy": params["policy"], "whitening": params["whitening"]}
 
     def loss(self, params: Params, batch: TaskBatch) -> tuple[jax.Array, dict[str, jax.Array]]:
         """The meta-objective (eq. 3), averaged over the tasks."""

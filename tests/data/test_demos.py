@@ -1,13 +1,16 @@
 """Demonstration sets: to disk and back, which frames and demonstrations a batch draws, what it renders."""
 
+import ast
 import dataclasses
 import functools
+import pathlib
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import milx
 from milx.data import demos as demos_lib
 
 MANY = 4
@@ -114,6 +117,26 @@ def test_cache_notices_other_arguments(trained, tmp_path, monkeypatch):
     assert len(asked) == len(requests), "each is planned once"
     get(0, "train", 2, 2, dataclasses.replace(data, plan_batch=7))
     assert len(asked) == len(requests), "the batch of the planner does not change the set"
+
+
+def test_the_hash_of_a_cached_set_covers_the_sources_that_it_depends_on():
+    """What environments and experts import of milx is hashed, or does not touch what is planned."""
+    root = pathlib.Path(milx.__file__).parent
+    hashed = {path for pattern in demos_lib.SOURCES for path in root.glob(pattern)}
+    harmless = {"parallel", "chunks", "config", "goals", "types", "render.raycast", "render.scene"}
+    imported = set()
+    for path in hashed:
+        for node in ast.walk(ast.parse(path.read_text()) if path.suffix == ".py" else ast.Module([], [])):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "milx":
+                modules = [f"{node.module}.{alias.name}" for alias in node.names]
+                imported |= {
+                    name if (root.parent / (name.replace(".", "/") + ".py")).is_file() else node.module
+                    for name in modules
+                }
+    assert "milx.render.textures" in imported
+    for name in imported - {f"milx.{short}" for short in harmless}:
+        path = root.parent / name.replace(".", "/")
+        assert path.with_suffix(".py") in hashed or path / "__init__.py" in hashed, name
 
 
 def test_sets_of_the_splits_share_no_colour(trained):

@@ -1,0 +1,107 @@
+"""Looks at a data set and says what will go wrong: python -m milx.data.check PATH."""
+
+import sys
+
+import numpy as np
+from absl import app
+from rich.console import Console
+from rich.table import Table
+
+from milx.data.dataset import DataSet
+from milx.envs.base import SPLITS
+from milx.whitening import MIN_STD
+
+MANY_ROWS = 256
+"""Images with more rows than this are slow to learn from."""
+_SPREAD = 3
+"""Times that the longest demonstration is longer than the shortest, beyond which resampling distorts."""
+
+
+def problems(data: DataSet) -> list[str]:
+    """What will go wrong, a sentence each, the worst first; reads all states and actions, and the first images."""
+    found, head = [], data.header
+    for split in SPLITS:
+        if not head.of_split(split):
+            found.append(f"no {split} tasks")
+    for task in head.tasks:
+        if len(task.lengths) < 2:
+            found.append(f"task {task.name!r} has {len(task.lengths)} demonstration: one more must be the query")
+        elif not any(task.has_action):
+            found.append(f"task {task.name!r} shows no actions: it cannot be learnt from")
+    lengths = [length for task in head.tasks for length in task.lengths]
+    if lengths and max(lengths) > _SPREAD * min(lengths):
+        found.append(f"lengths from {min(lengths)} to {max(lengths)} steps: all are resampled to recorded.horizon")
+    if head.image_shape is None:
+        found.append("no images: policies see states only")
+    elif head.image_shape[0] > MANY_ROWS:
+        found.append(f"images of {head.image_shape}: import them with fewer rows (--height)")
+    for field, values in vectors(data).items():
+        bad = ~np.isfinite(values)
+        if bad.any():
+            found.append(f"{field}: {int(bad.sum())} values are not finite")
+        for i in np.flatnonzero(np.nanstd(np.where(bad, np.nan, values), axis=0) < MIN_STD):
+            found.append(f"{field}[{i}] is constant: it says nothing")
+    for number, task in enumerate(head.tasks):
+        if head.image_shape is not None and task.lengths:
+            image = data.read(number, 0, np.zeros(1, int), fields=("image",)).image
+            if image.min() == image.max():
+                found.append(f"task {task.name!r}: the first image is of one colour")
+    return found
+
+
+def vectors(data: DataSet) -> dict[str, np.ndarray]:
+    """All states [F, S] and actions [F', A] there are."""
+    rows: dict[str, list[np.ndarray]] = {"state": [], "action": []}
+    for number, task in enumerate(data.header.tasks):
+        for demo in range(len(task.lengths)):
+            read = data.read(number, demo, fields=("state", "action"))
+            for field, values in rows.items():
+                if (value := getattr(read, field)) is not None:
+                    values.append(value)
+    return {field: np.concatenate(values) for field, values in rows.items() if values}
+
+
+def describe(data: DataSet, console: Console) -> None:
+    """Prints tasks, demonstrations, lengths and ranges."""
+    head = data.header
+    lengths = [length for task in head.tasks for length in task.lengths]
+    console.print(
+        f"{data.folder}: {len(head.tasks)} tasks, {len(lengths)} demonstrations, from {head.source or 'unknown'}"
+    )
+    image = "no images" if head.image_shape is None else f"images {head.image_shape[0]} x {head.image_shape[1]}"
+    if lengths:
+        median = int(np.median(lengths))
+        console.print(f"{image}; {min(lengths)} to {max(lengths)} steps, half of them at most {median}")
+    for split in SPLITS:
+        names = [head.tasks[i].name for i in head.of_split(split)]
+        console.print(
+            f"{split}: {len(names)} tasks{': ' if names else ''}{', '.join(names[:5])}{' ...' if names[5:] else ''}"
+        )
+    table = Table("", "least", "mean", "most", "standard deviation")
+    for field, values in vectors(data).items():
+        with np.errstate(invalid="ignore"):
+            for i, column in enumerate(values.T):
+                shown = (np.nanmin(column), np.nanmean(column), np.nanmax(column), np.nanstd(column))
+                table.add_row(f"{field}[{i}]", *(f"{value:.4g}" for value in shown))
+    console.print(table)
+
+
+def main(argv: list[str]) -> None:
+    """Prints what a data set holds, and its problems."""
+    if len(argv) != 2:
+        raise app.UsageError("expected one argument, PATH")
+    console = Console()
+    try:
+        data = DataSet(argv[1])
+        describe(data, console)
+        found = problems(data)
+    except ValueError as error:
+        sys.exit(f"milx: {error}")
+    for problem in found:
+        console.print(f"- {problem}")
+    if not found:
+        console.print("nothing seems wrong")
+
+
+if __name__ == "__main__":
+    app.run(main)

@@ -1,0 +1,295 @@
+"""Recorded demonstrations on disk: one folder for a data set, chunked arrays by task, readable with zarr alone.
+
+    zarr.json               a zarr (version 3) group; its attributes hold the header
+    00000/                  the first task: a group with all its demonstrations, one after the other
+        image               [F, H, W, 3] uint8, where there are images
+        state               [F, S] float32
+        action              [F, A] float32, NaN where a demonstration shows none
+
+The header names every task, its split ("train", "validation" or "test") and the lengths of its demonstrations.
+"""
+
+import dataclasses
+import hashlib
+import json
+import pathlib
+import shutil
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import numpy as np
+import tensorstore as ts
+
+from milx.envs.base import SPLITS
+from milx.types import Demo
+
+VERSION = 1
+ALL_FIELDS = ("image", "state", "action")
+_CHUNK_BYTES = 1 << 20
+_GROUP = {"zarr_format": 3, "node_type": "group"}
+
+
+@dataclasses.dataclass(frozen=True)
+class TaskInfo:
+    """A task of a data set.
+
+    Attributes:
+        name: what it is called.
+        split: "train", "validation" or "test".
+        lengths: time steps of each of its demonstrations.
+        has_action: whether each of them shows actions.
+    """
+
+    name: str
+    split: str
+    lengths: tuple[int, ...]
+    has_action: tuple[bool, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class Header:
+    """What a data set holds.
+
+    Attributes:
+        image_shape: (H, W); None without images.
+        state_size: S, 0 without states.
+        action_size: A.
+        tasks: all tasks, in the order of their folders.
+        source: where they come from, for people.
+    """
+
+    image_shape: tuple[int, int] | None
+    state_size: int
+    action_size: int
+    tasks: tuple[TaskInfo, ...]
+    source: str = ""
+
+    def of_split(self, split: str) -> list[int]:
+        """The numbers of the split's tasks."""
+        return [i for i, task in enumerate(self.tasks) if task.split == split]
+
+
+class Writer:
+    """Writes a data set task by task; the folder appears when all of it is written.
+
+        with Writer(folder, image_shape=(128, 128), state_size=8, action_size=7) as writer:
+            writer.add("pick up the cup", "train", [len(demo.state) for demo in demos], demos)
+
+    Args:
+        folder: the data set's; must not exist.
+        image_shape: (H, W); None without images.
+        state_size: S.
+        action_size: A.
+        source: where the demonstrations come from.
+
+    Raises:
+        ValueError: if the folder exists: nothing is written over.
+    """
+
+    def __init__(
+        self,
+        folder: str | pathlib.Path,
+        image_shape: tuple[int, int] | None,
+        state_size: int,
+        action_size: int,
+        source: str = "",
+    ):
+        self.folder = pathlib.Path(folder)
+        if self.folder.exists():
+            raise ValueError(f"out: {self.folder} exists, expected a folder that does not: nothing is written over")
+        self._header = Header(image_shape, state_size, action_size, (), source)
+        self._tasks: list[TaskInfo] = []
+        self._partial = self.folder.with_name(f"{self.folder.name}.partial")
+
+    def __enter__(self) -> "Writer":
+        """Starts from nothing; what an earlier attempt left unfinished is removed."""
+        shutil.rmtree(self._partial, ignore_errors=True)
+        self._partial.mkdir(parents=True)
+        return self
+
+    def __exit__(self, kind: type | None, *_: Any) -> None:
+        """Puts the folder in its place, or removes what was written if something went wrong."""
+        if kind is not None:
+            shutil.rmtree(self._partial, ignore_errors=True)
+            return
+        header = dataclasses.replace(self._header, tasks=tuple(self._tasks))
+        _write_group(self._partial, {"milx": {"version": VERSION, **dataclasses.asdict(header)}})
+        self._partial.rename(self.folder)
+
+    def add(self, name: str, split: str, lengths: list[int], demos: Iterable[Demo]) -> None:
+        """Writes a task.
+
+        Args:
+            name: of the task.
+            split: "train", "validation" or "test".
+            lengths: time steps of its demonstrations.
+            demos: as many; with arrays [T, ...], and no action where the demonstration shows none.
+
+        Raises:
+            ValueError: for a split that does not exist, or a demonstration of another shape than announced.
+        """
+        if split not in SPLITS:
+            raise ValueError(f"split of {name!r}: got {split!r}, expected one of {', '.join(SPLITS)}")
+        folder, total, head = self._partial / f"{len(self._tasks):05d}", sum(lengths), self._header
+        _write_group(folder, {"name": name})
+        arrays = {
+            field: _create(folder / field, (total, *shape), dtype) for field, (shape, dtype) in _fields(head).items()
+        }
+        start, has_action = 0, []
+        for i, (length, demo) in enumerate(zip(lengths, demos, strict=True)):
+            has_action.append(demo.action is not None)
+            if demo.action is None:
+                demo = dataclasses.replace(demo, action=np.full((length, head.action_size), np.nan))
+            for field, array in arrays.items():
+                value = np.asarray(getattr(demo, field))
+                expected = (length, *array.shape[1:])
+                if value.shape != expected:
+                    where = f"demonstration {i} of {name!r}: {field}"
+                    raise ValueError(f"{where}: got shape {list(value.shape)}, expected {list(expected)}")
+                array[start : start + length].write(value.astype(array.dtype.numpy_dtype)).result()
+            start += length
+        self._tasks.append(TaskInfo(name, split, tuple(lengths), tuple(has_action)))
+
+
+class DataSet:
+    """A data set on disk, opened for reading.
+
+    Args:
+        folder: as `Writer` leaves it.
+
+    Attributes:
+        header: what it holds.
+
+    Raises:
+        ValueError: for a folder that holds no data set, or whose arrays do not fit its header.
+    """
+
+    def __init__(self, folder: str | pathlib.Path):
+        self.folder = pathlib.Path(folder)
+        self.header = _read_header(self.folder)
+        self._arrays: dict[tuple[int, str], Any] = {}
+
+    def fingerprint(self) -> str:
+        """SHA-256 of the header and of all states and actions; images are told by their sizes alone."""
+        digest = hashlib.sha256(json.dumps(dataclasses.asdict(self.header)).encode())
+        for i in range(len(self.header.tasks)):
+            for field in ("state", "action"):
+                if field in _fields(self.header):
+                    digest.update(np.ascontiguousarray(self._array(i, field).read().result()).tobytes())
+        return digest.hexdigest()
+
+    def read(
+        self, task: int, demo: int, frames: np.ndarray | None = None, fields: tuple[str, ...] = ALL_FIELDS
+    ) -> Demo:
+        """A demonstration of a task, NumPy arrays [T, ...]; only these `frames` and `fields` if they are given."""
+        return self.read_later(task, demo, frames, fields)()
+
+    def read_later(
+        self, task: int, demo: int, frames: np.ndarray | None = None, fields: tuple[str, ...] = ALL_FIELDS
+    ) -> Callable[[], Demo]:
+        """Starts reading a demonstration; the result is a function that waits for it and returns it."""
+        info = self.header.tasks[task]
+        index = np.arange(info.lengths[demo]) if frames is None else frames
+        rows = sum(info.lengths[:demo]) + index
+        there = set(_fields(self.header)) - ({"action"} if not info.has_action[demo] else set())
+        begun = {field: self._array(task, field)[rows].read() for field in fields if field in there}
+
+        def finish() -> Demo:
+            return Demo(**{field: future.result() for field, future in begun.items()})
+
+        return finish
+
+    def _array(self, task: int, field: str) -> Any:
+        key = (task, field)
+        if key not in self._arrays:
+            path = self.folder / f"{task:05d}" / field
+            shape, dtype = _fields(self.header)[field]
+            expected = (sum(self.header.tasks[task].lengths), *shape)
+            try:
+                array = ts.open({"driver": "zarr3", "kvstore": _kvstore(path)}, open=True, read=True).result()
+            except ValueError as error:
+                raise ValueError(f"{path}: cannot be opened: {error}") from error
+            if array.shape != expected or array.dtype.numpy_dtype != dtype:
+                got = f"{array.dtype.name} {list(array.shape)}"
+                raise ValueError(f"{path}: got {got}, expected {np.dtype(dtype).name} {list(expected)}")
+            self._arrays[key] = array
+        return self._arrays[key]
+
+
+def spread(length: int, horizon: int) -> np.ndarray:
+    """[horizon] time steps spread evenly over a demonstration, the first and the last among them.
+
+    Steps are repeated where the demonstration is shorter. What was done at a step stays what was done there, so
+    nothing needs to be interpolated.
+    """
+    return np.linspace(0, length - 1, horizon).round().astype(int)
+
+
+def _fields(header: Header) -> dict[str, tuple[tuple[int, ...], Any]]:
+    """Shape of a time step and type of every array."""
+    fields: dict[str, tuple[tuple[int, ...], Any]] = {"action": ((header.action_size,), np.float32)}
+    if header.state_size:
+        fields["state"] = ((header.state_size,), np.float32)
+    if header.image_shape is not None:
+        fields["image"] = ((*header.image_shape, 3), np.uint8)
+    return fields
+
+
+def _kvstore(path: pathlib.Path) -> dict[str, str]:
+    return {"driver": "file", "path": f"{path.absolute()}/"}
+
+
+def _create(path: pathlib.Path, shape: tuple[int, ...], dtype: Any) -> Any:
+    frame = int(np.prod(shape[1:])) * np.dtype(dtype).itemsize
+    chunk = [max(1, min(shape[0], _CHUNK_BYTES // max(frame, 1))), *shape[1:]]
+    metadata = {
+        "shape": list(shape),
+        "data_type": np.dtype(dtype).name,
+        "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": chunk}},
+        "codecs": [{"name": "bytes"}, {"name": "zstd", "configuration": {"level": 1}}],
+    }
+    spec = {"driver": "zarr3", "kvstore": _kvstore(path), "metadata": metadata}
+    return ts.open(spec, create=True).result()
+
+
+def _write_group(folder: pathlib.Path, attributes: dict[str, Any]) -> None:
+    folder.mkdir(exist_ok=True)
+    (folder / "zarr.json").write_text(json.dumps({**_GROUP, "attributes": attributes}, indent=1) + "\n")
+
+
+def _read_header(folder: pathlib.Path) -> Header:
+    path = folder / "zarr.json"
+    if not path.is_file():
+        raise ValueError(f"data: {folder} has no zarr.json, expected a folder written by milx.data")
+    try:
+        values = json.loads(path.read_text())["attributes"]["milx"]
+        version = values.pop("version")
+        if version != VERSION:
+            raise ValueError(f"version: got {version!r}, expected {VERSION}")
+        return _parse_header(values)
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
+        raise ValueError(f"{path}: no header of a milx data set: {error}") from error
+
+
+def _parse_header(values: dict[str, Any]) -> Header:
+    shape = values["image_shape"]
+    sizes = [values["state_size"], values["action_size"], *(shape or ())]
+    if not all(isinstance(size, int) and 0 <= size < 1 << 20 for size in sizes) or (shape and len(shape) != 2):
+        raise ValueError(f"sizes: got image_shape {shape}, state_size {sizes[0]} and action_size {sizes[1]}")
+    tasks = []
+    for i, task in enumerate(values["tasks"]):
+        info = TaskInfo(task["name"], task["split"], tuple(task["lengths"]), tuple(task["has_action"]))
+        if info.split not in SPLITS:
+            raise ValueError(f"tasks[{i}].split: got {info.split!r}, expected one of {', '.join(SPLITS)}")
+        if not all(isinstance(length, int) and length > 0 for length in info.lengths):
+            raise ValueError(f"tasks[{i}].lengths: got {list(info.lengths)}, expected positive numbers")
+        if len(info.has_action) != len(info.lengths):
+            raise ValueError(f"tasks[{i}].has_action: got {len(info.has_action)}, expected {len(info.lengths)}")
+        tasks.append(info)
+    return Header(
+        None if shape is None else tuple(shape),
+        values["state_size"],
+        values["action_size"],
+        tuple(tasks),
+        str(values["source"]),
+    )

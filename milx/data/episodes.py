@@ -1,0 +1,189 @@
+"""What importers share: which episodes make a task, which tasks make a split, and writing them down."""
+
+import hashlib
+import json
+import pathlib
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from absl import app, flags
+from PIL import Image
+from rich.progress import track
+
+from milx.data.dataset import Writer
+from milx.types import Demo
+
+MAX_BYTES = 1 << 33
+"""Of an array that has to be in memory at once: a larger one is refused before there is memory for it."""
+FLAGS = flags.FLAGS
+
+
+class Episode(NamedTuple):
+    """One demonstration of a source.
+
+    Attributes:
+        task: the name of its task.
+        length: its time steps.
+        has_action: whether it shows actions.
+        read: reads its arrays.
+    """
+
+    task: str
+    length: int
+    has_action: bool
+    read: Callable[[], Demo]
+
+
+class Sizes(NamedTuple):
+    """(H, W) of the images or None, S and A, as in a data set's header."""
+
+    image_shape: tuple[int, int] | None
+    state: int
+    action: int
+
+
+class Source(Protocol):
+    """What an importer makes of the files of others."""
+
+    sizes: Sizes
+
+    def episodes(self, task: str) -> list[Episode]:
+        """All episodes; `task` says what makes a task."""
+
+
+def define_flags(*, state: str, action: str, task: str) -> None:
+    """Defines the flags of an importer's command line, with these defaults."""
+    flags.DEFINE_string("camera", None, "Where the images are; the only camera if not given, none if empty.")
+    flags.DEFINE_string("state", state, "Where the robot's state is; empty for none.")
+    flags.DEFINE_string("action", action, "Where the actions are; empty for none.")
+    flags.DEFINE_string("task", task, "What makes a task: see above.")
+    flags.DEFINE_integer("height", 128, "Most rows of an image; larger ones are shrunk.", lower_bound=1)
+    flags.DEFINE_float("validation", 0.1, "Part of the tasks that becomes validation tasks.")
+    flags.DEFINE_float("test", 0.1, "Part of the tasks that becomes test tasks.")
+
+
+def run(argv: list[str], open_source: Callable[[str, Any], Source]) -> None:
+    """The command line of an importer: PATH OUT; bad input ends with a message, not a traceback."""
+    if len(argv) != 3:
+        raise app.UsageError("expected two arguments, PATH and OUT")
+    try:
+        source = open_source(argv[1], FLAGS)
+        write(argv[2], source.episodes(FLAGS.task), source.sizes, (FLAGS.validation, FLAGS.test), argv[1])
+    except ValueError as error:
+        sys.exit(f"milx: {error}")
+    print(f"{argv[2]}: look at it with `python -m milx.data.check {argv[2]}`")
+
+
+def write(
+    out: str | pathlib.Path, episodes: Iterable[Episode], sizes: Sizes, held_out: tuple[float, float], source: str
+) -> None:
+    """Writes episodes as a data set (`milx.data.dataset`), its tasks in the order of their names.
+
+    Args:
+        out: the folder; must not exist.
+        episodes: all of them, in any order.
+        sizes: of what they show.
+        held_out: which parts of the tasks become validation and test tasks.
+        source: where they come from.
+
+    Raises:
+        ValueError: for parts that are none, or an episode that does not fit the sizes.
+    """
+    tasks: dict[str, list[Episode]] = {}
+    for episode in episodes:
+        tasks.setdefault(episode.task, []).append(episode)
+    splits = split_tasks(sorted(tasks), *held_out)
+    with Writer(out, *sizes, source) as writer:
+        for name in track(sorted(tasks), "writing tasks"):
+            own = tasks[name]
+            demos = (_as_written(episode, sizes) for episode in own)
+            writer.add(name, splits[name], [episode.length for episode in own], demos)
+
+
+def split_tasks(names: list[str], validation: float, test: float) -> dict[str, str]:
+    """The split of every task, in an order that depends on nothing but the names; at least one trains.
+
+    Raises:
+        ValueError: unless the parts are at least 0 and leave something for training.
+    """
+    for field, part in (("validation", validation), ("test", test)):
+        if not 0 <= part < 1:
+            raise ValueError(f"{field}: got {part}, expected a part of the tasks, at least 0 and less than 1")
+    if validation + test >= 1:
+        raise ValueError(f"validation + test: got {validation + test}, expected less than 1: the rest is for training")
+    shuffled = sorted(names, key=lambda name: hashlib.sha256(name.encode()).digest())
+    first, second = round(validation * len(names)), round((validation + test) * len(names))
+    of = lambda i: "validation" if i < first else "test" if i < second else "train"  # noqa: E731
+    return {name: of(i) for i, name in enumerate(shuffled)}
+
+
+def read_mapping(path: str | pathlib.Path) -> dict[str, str]:
+    """A JSON object from the names of episodes to the names of their tasks.
+
+    Raises:
+        ValueError: for a file that holds something else.
+    """
+    try:
+        mapping = json.loads(pathlib.Path(path).read_text())
+    except (OSError, ValueError) as error:
+        raise ValueError(f"task: {path} is no JSON file: {error}") from error
+    if not isinstance(mapping, dict) or not all(isinstance(task, str) for task in mapping.values()):
+        raise ValueError(f"task: {path}: expected a JSON object from names of episodes to names of tasks")
+    return mapping
+
+
+def lookup(mapping: dict[str, str], name: str, path: str) -> str:
+    """The task of an episode.
+
+    Raises:
+        ValueError: if the mapping does not say.
+    """
+    if name not in mapping:
+        raise ValueError(f"task: {path} does not say to which task episode {name!r} belongs")
+    return mapping[name]
+
+
+def inside(root: pathlib.Path, path: str | pathlib.Path) -> pathlib.Path:
+    """A file of a data set, as its metadata names it.
+
+    Raises:
+        ValueError: if that leads out of the data set's folder, by "..", an absolute path or a link, or to no file.
+    """
+    found = (root / path).resolve()
+    if not found.is_relative_to(root.resolve()):
+        raise ValueError(f"{root}: {path} leads out of the data set's folder")
+    if not found.is_file():
+        raise ValueError(f"{root}: {path} is missing")
+    return found
+
+
+def shrunk(shape: tuple[int, ...], height: int) -> tuple[int, int]:
+    """(H, W) of an image of this shape with at most `height` rows, in the same proportions."""
+    scale = min(1.0, height / shape[0])
+    return max(1, round(scale * shape[0])), max(1, round(scale * shape[1]))
+
+
+def resized(images: Iterator[np.ndarray], shape: tuple[int, int]) -> Iterator[np.ndarray]:
+    """Images [H, W, 3] uint8, each as large as `shape`; means over areas where they shrink."""
+    for image in images:
+        if image.shape[:2] != shape:
+            image = np.asarray(Image.fromarray(image).resize(shape[::-1], Image.Resampling.BOX))
+        yield image
+
+
+def check_size(field: str, shape: tuple[int, ...], itemsize: int) -> None:
+    """Raises ValueError for an array that no one can mean, before there is memory for it."""
+    size = itemsize * int(np.prod([int(n) for n in shape], dtype=object))
+    if size > MAX_BYTES:
+        raise ValueError(
+            f"{field}: got shape {list(shape)}, {size / 2**30:.3g} GiB, expected at most {MAX_BYTES >> 30}"
+        )
+
+
+def _as_written(episode: Episode, sizes: Sizes) -> Demo:
+    demo = episode.read()
+    action = None if demo.action is None else np.asarray(demo.action, np.float32)
+    state = np.asarray(demo.state, np.float32) if sizes.state else None
+    return Demo(demo.image if sizes.image_shape else None, state, action)

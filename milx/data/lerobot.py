@@ -1,0 +1,246 @@
+"""Imports a LeRobot data set (version 3: parquet and MP4); neither LeRobot nor PyTorch is needed.
+
+    python -m milx.data.lerobot PATH OUT --camera=observation.images.top
+    python -m milx.data.lerobot PATH OUT --state=observation.state --action=action --task=tasks.json
+
+PATH is the data set's folder, the one with meta/ and data/. A task is what the episodes say (--task=task_index), a data
+file (--task=file), or what a JSON file says that maps the numbers of episodes to names of tasks.
+"""
+
+import functools
+import io
+import json
+import pathlib
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from absl import app
+from PIL import Image
+
+from milx.data import episodes as shared
+from milx.data.episodes import Episode, Sizes
+from milx.types import Demo
+
+_CONVERTER = "python -m lerobot.datasets.v30.convert_dataset_v21_to_v30"
+_PLACEHOLDER = re.compile(r"\{(\w+)(?::0?(\d+)d)?\}")
+
+
+class LeRobot:
+    """A data set of LeRobot's version 3, opened for reading.
+
+    Args:
+        root: its folder.
+        camera: the feature that holds images; "" for none, None for the only one.
+        state: the feature that holds the robot's state; "" for none.
+        action: the feature that holds actions; "" for none.
+        height: most rows of an image; larger ones are shrunk.
+
+    Raises:
+        ValueError: for another version (the message names LeRobot's converter), a feature that does not exist or does
+            not fit, or files that are missing, damaged or outside the folder.
+    """
+
+    def __init__(self, root: str | pathlib.Path, camera: str | None, state: str, action: str, height: int):
+        self.root, self.height = pathlib.Path(root), height
+        self.info = self._read_info()
+        self.camera = self._only_camera() if camera is None else camera
+        self.state, self.action = state, action
+        image_shape = None
+        if self.camera:
+            image_shape = shared.shrunk(self._shape(self.camera, ("video", "image"), 3)[:2], height)
+        vector = lambda name: self._shape(name, ("float32", "float64", "int64"), 1)[0] if name else 0  # noqa: E731
+        self.sizes = Sizes(image_shape, vector(state), vector(action))
+
+    def episodes(self, task: str) -> list[Episode]:
+        """All episodes.
+
+        Args:
+            task: "task_index", "file", or the path of a JSON file.
+        """
+        mapping = None if task in ("task_index", "file") else shared.read_mapping(task)
+        found = []
+        for row in self._rows():
+            number, file = row["episode_index"], self._data_file(row)
+            if mapping is not None:
+                name = shared.lookup(mapping, str(number), task)
+            else:
+                name = file.relative_to(self.root.resolve()).as_posix() if task == "file" else str(row["tasks"][0])
+            read = functools.partial(self._read, row, file)
+            found.append(Episode(name, row["length"], bool(self.action), read))
+        return found
+
+    def _read(self, row: dict[str, Any], file: pathlib.Path) -> Demo:
+        length, number = row["length"], row["episode_index"]
+        table = _read_table(file)
+        kept = np.flatnonzero(table["episode_index"].to_numpy() == number)
+        if len(kept) != length:
+            raise ValueError(f"{file}: got {len(kept)} rows of episode {number}, expected {length}")
+
+        def vectors(name: str, size: int) -> np.ndarray:
+            values = table[name].take(kept).to_pylist()
+            try:
+                return np.array(values, np.float32).reshape(length, size)
+            except (ValueError, TypeError) as error:
+                raise ValueError(
+                    f"{file}: {name} of episode {number}: expected {size} numbers a row ({error})"
+                ) from error
+
+        state = vectors(self.state, self.sizes.state) if self.state else None
+        action = vectors(self.action, self.sizes.action) if self.action else None
+        image = None
+        if self.sizes.image_shape is not None:
+            shared.check_size(f"{self.camera} of episode {number}", (length, *self.sizes.image_shape, 3), 1)
+            is_video = self.info["features"][self.camera]["dtype"] == "video"
+            frames = self._video(row) if is_video else _images(file, table[self.camera].take(kept).to_pylist())
+            image = np.stack(list(shared.resized(frames, self.sizes.image_shape)))
+        return Demo(image, state, action)
+
+    def _video(self, row: dict[str, Any]) -> Iterator[np.ndarray]:
+        """The episode's part of its video file."""
+        prefix = f"videos/{self.camera}"
+        values = {"video_key": self.camera}
+        values |= {name: row[f"{prefix}/{name}"] for name in ("chunk_index", "file_index")}
+        file = shared.inside(self.root, _fill(self.info["video_path"], values))
+        yield from read_video(file, row[f"{prefix}/from_timestamp"], row["length"], self.info["fps"])
+
+    def _rows(self) -> list[dict[str, Any]]:
+        """What meta/episodes says of every episode, in order."""
+        columns = ["episode_index", "tasks", "length", "data/chunk_index", "data/file_index"]
+        if self.camera and self.info["features"][self.camera]["dtype"] == "video":
+            prefix = f"videos/{self.camera}"
+            columns += [f"{prefix}/chunk_index", f"{prefix}/file_index", f"{prefix}/from_timestamp"]
+        rows = []
+        for path in sorted((self.root / "meta" / "episodes").glob("*/*.parquet")):
+            table = _read_table(shared.inside(self.root, path.relative_to(self.root)))
+            if missing := sorted(set(columns) - set(table.column_names)):
+                raise ValueError(f"{path}: has no column {missing[0]!r}")
+            rows += table.select(columns).to_pylist()
+        if not rows:
+            raise ValueError(f"{self.root}: meta/episodes holds no episodes")
+        for row in rows:
+            if not isinstance(row["length"], int) or row["length"] < 1:
+                raise ValueError(
+                    f"{self.root}: episode {row['episode_index']}: length: got {row['length']}, expected > 0"
+                )
+            if not row["tasks"]:
+                raise ValueError(f"{self.root}: episode {row['episode_index']} has no task")
+        return sorted(rows, key=lambda row: row["episode_index"])
+
+    def _data_file(self, row: dict[str, Any]) -> pathlib.Path:
+        values = {name: row[f"data/{name}"] for name in ("chunk_index", "file_index")}
+        return shared.inside(self.root, _fill(self.info["data_path"], values))
+
+    def _read_info(self) -> dict[str, Any]:
+        path = self.root / "meta" / "info.json"
+        if not path.is_file():
+            raise ValueError(f"{self.root} has no meta/info.json, expected a LeRobot data set")
+        try:
+            info = json.loads(path.read_text())
+            version = str(info["codebase_version"])
+            features, fps = info["features"], info["fps"]
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"{path}: not LeRobot's metadata: {error!r}") from error
+        if version.startswith("v2"):
+            raise ValueError(f"{path}: codebase_version: got {version}, expected v3.0; convert it with `{_CONVERTER}`")
+        if not version.startswith("v3"):
+            raise ValueError(f"{path}: codebase_version: got {version}, expected v3.0")
+        if not isinstance(features, dict) or not isinstance(fps, int | float) or not fps > 0:
+            raise ValueError(f"{path}: features or fps: not as in LeRobot's metadata")
+        return info
+
+    def _only_camera(self) -> str:
+        cameras = [name for name, feature in self.info["features"].items() if feature["dtype"] in ("video", "image")]
+        if len(cameras) > 1:
+            raise ValueError(f"camera: expected one of {', '.join(cameras)}, or none with --camera=")
+        return cameras[0] if cameras else ""
+
+    def _shape(self, name: str, dtypes: tuple[str, ...], axes: int) -> tuple[int, ...]:
+        features = self.info["features"]
+        if name not in features:
+            raise ValueError(f"feature: got {name!r}, expected one of {', '.join(features)}")
+        dtype, shape = features[name].get("dtype"), tuple(features[name].get("shape", ()))
+        if dtype not in dtypes or len(shape) != axes or not all(isinstance(n, int) and n > 0 for n in shape):
+            expected = f"{' or '.join(dtypes)} with {axes} axes"
+            raise ValueError(f"feature {name!r}: got {dtype} {list(shape)}, expected {expected}")
+        if axes == 3 and shape[0] == 3 and shape[2] != 3:  # channels first
+            shape = (*shape[1:], 3)
+        if axes == 3 and shape[2] != 3:
+            raise ValueError(f"feature {name!r}: got {list(shape)}, expected images with 3 channels")
+        return shape
+
+
+def read_video(file: pathlib.Path, start: float, count: int, fps: float) -> Iterator[np.ndarray]:
+    """Frames [H, W, 3] uint8 of a video: `count` of them, from `start` (s), 1/fps apart.
+
+    Raises:
+        ValueError: if the file is no video, or has no frame at one of those times.
+    """
+    try:
+        import av
+    except ImportError as error:
+        raise ValueError("reading videos needs the package av: pip install 'milx[lerobot]'") from error
+    wanted = 0
+    try:
+        with av.open(str(file)) as container:
+            stream = container.streams.video[0]
+            stream.thread_type = "AUTO"
+            container.seek(int(start * av.time_base))
+            for frame in container.decode(stream):
+                # Frames are taken by their times: a seek goes to the key frame before.
+                while wanted < count and abs(float(frame.time or 0.0) - (start + wanted / fps)) < 0.5 / fps:
+                    yield frame.to_ndarray(format="rgb24")
+                    wanted += 1
+                if wanted == count:
+                    return
+    except (av.FFmpegError, IndexError) as error:
+        raise ValueError(f"{file}: no video that can be read: {error}") from error
+    raise ValueError(f"{file}: has no frame at {start + wanted / fps:.3f} s")
+
+
+def _images(file: pathlib.Path, values: list[Any]) -> Iterator[np.ndarray]:
+    for value in values:
+        try:
+            yield np.asarray(Image.open(io.BytesIO(value["bytes"])).convert("RGB"))
+        except (OSError, TypeError, KeyError, Image.DecompressionBombError) as error:
+            raise ValueError(f"{file}: an image that cannot be read: {error}") from error
+
+
+def _fill(template: Any, values: dict[str, Any]) -> str:
+    """A path with numbers and names in place of {name} and {name:03d}; nothing else is understood."""
+
+    def replace(match: re.Match[str]) -> str:
+        name, width = match.groups()
+        if name not in values:
+            raise ValueError(f"path {template!r}: got {{{name}}}, expected {', '.join(values)}")
+        return str(values[name]).zfill(int(width or 0))
+
+    return _PLACEHOLDER.sub(replace, str(template))
+
+
+@functools.lru_cache(maxsize=4)
+def _read_table(file: pathlib.Path) -> Any:
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError as error:
+        raise ValueError("reading LeRobot data needs the package pyarrow: pip install 'milx[lerobot]'") from error
+    try:
+        metadata = pyarrow.parquet.read_metadata(file)
+        shared.check_size(
+            str(file), (sum(metadata.row_group(i).total_byte_size for i in range(metadata.num_row_groups)),), 1
+        )
+        return pyarrow.parquet.read_table(file)
+    except (pyarrow.ArrowException, OSError) as error:
+        raise ValueError(f"{file}: no parquet file that can be read: {error}") from error
+
+
+def main(argv: list[str]) -> None:
+    """Imports PATH as OUT."""
+    shared.run(argv, lambda path, flags: LeRobot(path, flags.camera, flags.state, flags.action, flags.height))
+
+
+if __name__ == "__main__":
+    shared.define_flags(state="observation.state", action="action", task="task_index")
+    app.run(main)

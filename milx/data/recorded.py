@@ -1,0 +1,180 @@
+"""Recorded demonstrations on the device, loaded while the scan before runs; batches like those of simulated ones."""
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from milx.data.dataset import DataSet, spread
+from milx.data.demos import frame_indices
+from milx.goals import goals
+from milx.types import Array, Demo, TaskBatch
+
+MOST_DEMOS = 16
+"""Demonstrations of a task that are on the device at once; of more, some are drawn."""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Recorded:
+    """D demonstrations of each of N tasks, resampled to T time steps. Where a task has fewer, zeros fill the rest.
+
+    Attributes:
+        demo: with leading axes [N, D, T]; actions are 0 where a demonstration shows none.
+        there: [N, D] bool, whether it is a demonstration.
+        acts: [N, D] bool, whether it is one that shows actions.
+    """
+
+    demo: Demo
+    there: Array
+    acts: Array
+
+
+def shape_of(data: DataSet, num_tasks: int, num_demos: int, horizon: int) -> Recorded:
+    """Shapes and types of `load`'s result."""
+    lead, head = (num_tasks, num_demos, horizon), data.header
+    image = None if head.image_shape is None else jax.ShapeDtypeStruct((*lead, *head.image_shape, 3), np.uint8)
+    state, action = (jax.ShapeDtypeStruct((*lead, size), np.float32) for size in (head.state_size, head.action_size))
+    which = jax.ShapeDtypeStruct(lead[:2], np.bool_)
+    return Recorded(Demo(image, state, action), which, which)
+
+
+def load(data: DataSet, tasks: Sequence[int], demos: Sequence[Sequence[int]], horizon: int) -> Recorded:
+    """Reads demonstrations, all at once, as NumPy arrays.
+
+    Args:
+        data: where from.
+        tasks: N task numbers.
+        demos: the numbers of the demonstrations of each; D is the most of them.
+        horizon: T.
+    """
+    like = shape_of(data, len(tasks), max(len(chosen) for chosen in demos), horizon)
+    whole = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), like)
+    pending = []
+    for n, (task, chosen) in enumerate(zip(tasks, demos, strict=True)):
+        for d, number in enumerate(chosen):
+            frames = spread(data.header.tasks[task].lengths[number], horizon)
+            pending.append((n, d, data.read_later(task, number, frames)))
+    for n, d, finish in pending:
+        demo = finish()
+        whole.there[n, d], whole.acts[n, d] = True, demo.action is not None
+        for field in ("image", "state", "action"):
+            if (value := getattr(demo, field)) is not None:
+                getattr(whole.demo, field)[n, d] = value
+    return whole
+
+
+def sample_batch(
+    recorded: Recorded,
+    keys: jax.Array,
+    shots: int,
+    support_frames: int | None,
+    query_frames: int | None,
+    given_action: bool,
+    goal_indices: tuple[int, ...],
+) -> TaskBatch:
+    """Draws tasks and different demonstrations of each; the query is one that shows actions.
+
+    Args:
+        recorded: where to draw from.
+        keys: [N] keys; each draws one task, with replacement, of those with enough demonstrations.
+        shots: K, support demonstrations.
+        support_frames: time steps drawn from each support demonstration; None for all.
+        query_frames: time steps drawn from the query demonstration; None for all.
+        given_action: the support, too, must show actions.
+        goal_indices: entries of the state that tell where the robot is (`milx.goals`).
+    """
+    support = recorded.acts if given_action else recorded.there
+    enough = (recorded.acts.any(axis=1) & (support.sum(axis=1) > shots)).astype(jnp.float32)
+    horizon = recorded.demo.action.shape[2]
+
+    def sample_task(key: jax.Array) -> TaskBatch:
+        task_key, query_key, support_key, *frame_keys = jax.random.split(key, 4 + shots)
+        n = jax.random.choice(task_key, len(enough), p=enough / enough.sum())
+        acts = recorded.acts[n].astype(jnp.float32)
+        query = jax.random.choice(query_key, len(acts), p=acts / acts.sum())
+        others = support[n].astype(jnp.float32).at[query].set(0.0)
+        chosen = jax.random.choice(support_key, len(acts), (shots,), replace=False, p=others / others.sum())
+
+        def show(d: jax.Array, key: jax.Array, frames: int | None) -> Demo:
+            index = frame_indices(key, horizon, frames)
+            demo = jax.tree.map(lambda x: x[n, d], recorded.demo)
+            return jax.tree.map(lambda x: x[index], with_goals(demo, goal_indices))
+
+        shown = [show(chosen[k], frame_keys[k], support_frames) for k in range(shots)]
+        asked = show(query, frame_keys[shots], query_frames)
+        return TaskBatch(
+            support=jax.tree.map(lambda *xs: jnp.stack(xs), *shown), query=jax.tree.map(lambda x: x[None], asked)
+        )
+
+    return jax.vmap(sample_task)(keys)
+
+
+def with_goals(demo: Demo, indices: tuple[int, ...]) -> Demo:
+    """A demonstration [T, ...] with its goals, if entries of the state tell them."""
+    return dataclasses.replace(demo, goal=goals(demo.state, indices, None)) if indices else demo
+
+
+class Shards:
+    """What training draws its batches from: the whole split, or as much of it as fits, new for every scan.
+
+    While one scan runs, the next one's shard is read and copied to the device. Which tasks and demonstrations are in
+    it is a function of the seed and the scan.
+
+    Args:
+        data: the data set.
+        tasks: numbers of the tasks to train on.
+        horizon: T.
+        gib: room for a shard; two are on the device at times.
+        seed: draws the shards.
+
+    Raises:
+        ValueError: if not even one task fits.
+    """
+
+    def __init__(self, data: DataSet, tasks: Sequence[int], horizon: int, gib: float, seed: int):
+        self.data, self.tasks, self.horizon, self.seed = data, list(tasks), horizon, seed
+        most = max(len(data.header.tasks[i].lengths) for i in self.tasks)
+        self.num_demos = min(most, MOST_DEMOS)
+        of_task = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(shape_of(data, 1, self.num_demos, horizon)))
+        if of_task > gib * 2**30:
+            raise ValueError(f"recorded.gib: got {gib}, expected at least {of_task / 2**30:.3g}, the size of a task")
+        self.num_tasks = min(len(self.tasks), int(gib * 2**30 // of_task))
+        self.whole = self.num_tasks == len(self.tasks) and most <= MOST_DEMOS
+        self._pool = ThreadPoolExecutor(max_workers=1)
+        self._coming: dict[int, Future[Recorded]] = {}
+
+    @functools.cached_property
+    def shapes(self) -> Recorded:
+        """Shapes and types of a shard."""
+        return shape_of(self.data, self.num_tasks, self.num_demos, self.horizon)
+
+    def at(self, scan: int) -> Recorded:
+        """The shard of a scan; the next one's is begun."""
+        if self.whole:
+            scan = 0
+        for wanted in (scan, scan if self.whole else scan + 1):
+            if wanted not in self._coming:
+                self._coming[wanted] = self._pool.submit(self._load, wanted)
+        self._coming = {number: future for number, future in self._coming.items() if number >= scan}
+        return self._coming[scan].result()
+
+    def _load(self, scan: int) -> Recorded:
+        tasks, demos = self.chosen(scan)
+        loaded = load(self.data, tasks, demos, self.horizon)
+        fill = self.num_demos - loaded.there.shape[1]  # as large as every shard
+        return jax.device_put(jax.tree.map(lambda x: np.pad(x, [(0, 0), (0, fill)] + [(0, 0)] * (x.ndim - 2)), loaded))
+
+    def chosen(self, scan: int) -> tuple[list[int], list[list[int]]]:
+        """The numbers of a shard's tasks, and of the demonstrations of each."""
+        rng = np.random.default_rng([self.seed, scan])
+        tasks = self.tasks if self.whole else rng.choice(self.tasks, self.num_tasks, replace=False).tolist()
+        demos = []
+        for task in tasks:
+            count = len(self.data.header.tasks[task].lengths)
+            demos.append(sorted(rng.choice(count, min(count, self.num_demos), replace=False).tolist()))
+        return tasks, demos

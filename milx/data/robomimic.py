@@ -1,0 +1,151 @@
+"""Imports demonstrations in robomimic's layout of HDF5: data/demo_0/obs/agentview_image, data/demo_0/actions, ...
+
+    python -m milx.data.robomimic PATH OUT --camera=agentview_image --state=robot0_eef_pos,robot0_gripper_qpos
+
+PATH is a file, or a folder of *.hdf5 files. Every file is a task (--task=file), or a JSON file says which task a group
+belongs to, by names such as "lift/demo_0", the file without its suffix and the group.
+"""
+
+import functools
+import pathlib
+import re
+from typing import Any
+
+import numpy as np
+from absl import app
+
+from milx.data import episodes as shared
+from milx.data.episodes import Episode, Sizes
+from milx.types import Demo
+
+
+class Robomimic:
+    """One or several files of robomimic's layout, opened for reading.
+
+    Args:
+        path: a file, or a folder of *.hdf5 files.
+        camera: the observation that holds images; "" for none, None for the only one.
+        state: observations that together are the robot's state, separated by commas; "" for none.
+        action: the data set that holds the actions; "" for none.
+        height: most rows of an image; larger ones are shrunk.
+
+    Raises:
+        ValueError: if there are no such files, or the first demonstration lacks something or has it in another shape.
+    """
+
+    def __init__(self, path: str | pathlib.Path, camera: str | None, state: str, action: str, height: int):
+        root = pathlib.Path(path)
+        self.files = sorted(root.glob("*.hdf5")) if root.is_dir() else [root]
+        if not self.files or not self.files[0].is_file():
+            raise ValueError(f"{path}: expected a file in robomimic's layout, or a folder of *.hdf5 files")
+        self.state, self.action = [name for name in state.split(",") if name], action
+        with _open(self.files[0]) as file:
+            demo = _demos(file)[0]
+            self.camera = self._only_camera(file, demo) if camera is None else camera
+            lead = f"data/{demo}/obs"
+            shape = _dataset(file, f"{lead}/{self.camera}", 4).shape[1:] if self.camera else None
+            size = sum(_dataset(file, f"{lead}/{name}", 2).shape[1] for name in self.state)
+            actions = _dataset(file, f"data/{demo}/{action}", 2).shape[1] if action else 0
+        self.sizes = Sizes(None if shape is None else shared.shrunk(shape, height), size, actions)
+
+    def episodes(self, task: str) -> list[Episode]:
+        """All demonstrations.
+
+        Args:
+            task: "file", or the path of a JSON file.
+        """
+        mapping = None if task == "file" else shared.read_mapping(task)
+        found = []
+        for path in self.files:
+            with _open(path) as file:
+                for demo in _demos(file):
+                    name = f"{path.stem}/{demo}"
+                    own = path.stem if mapping is None else shared.lookup(mapping, name, task)
+                    length = self._length(file, demo)
+                    found.append(Episode(own, length, bool(self.action), functools.partial(self._read, path, demo)))
+        return found
+
+    def _names(self, demo: str) -> dict[str, int]:
+        """The data sets that are read of a demonstration, and their axes."""
+        names = {f"data/{demo}/obs/{name}": 2 for name in self.state}
+        if self.camera:
+            names[f"data/{demo}/obs/{self.camera}"] = 4
+        if self.action:
+            names[f"data/{demo}/{self.action}"] = 2
+        return names
+
+    def _length(self, file: Any, demo: str) -> int:
+        lengths = {name: len(_dataset(file, name, axes)) for name, axes in self._names(demo).items()}
+        if len(set(lengths.values())) != 1 or 0 in lengths.values():
+            raise ValueError(f"{file.filename}: data/{demo}: got lengths {lengths}, expected one that is at least 1")
+        return next(iter(lengths.values()))
+
+    def _read(self, path: pathlib.Path, demo: str) -> Demo:
+        with _open(path) as file:
+            lead = f"data/{demo}"
+            action = _dataset(file, f"{lead}/{self.action}", 2)[:] if self.action else None
+            states = [_dataset(file, f"{lead}/obs/{name}", 2)[:] for name in self.state]
+            image = None
+            if self.sizes.image_shape is not None:
+                frames = _dataset(file, f"{lead}/obs/{self.camera}", 4)
+                if frames.dtype != np.uint8 or frames.shape[-1] != 3:
+                    got = f"{frames.dtype} {list(frames.shape)}"
+                    raise ValueError(f"{path}: {frames.name}: got {got}, expected uint8 [T, H, W, 3]")
+                image = np.stack(list(shared.resized(iter(frames), self.sizes.image_shape)))
+            return Demo(image, np.concatenate(states, axis=1) if states else None, action)
+
+    def _only_camera(self, file: Any, demo: str) -> str:
+        cameras = [name for name in file.get(f"data/{demo}/obs", {}) if name.endswith("_image")]
+        if len(cameras) > 1:
+            raise ValueError(f"camera: expected one of {', '.join(cameras)}, or none with --camera=")
+        return cameras[0] if cameras else ""
+
+
+def _open(path: pathlib.Path) -> Any:
+    try:
+        import h5py
+    except ImportError as error:
+        raise ValueError("reading robomimic's files needs the package h5py: pip install 'milx[robomimic]'") from error
+    try:
+        return h5py.File(path, "r")
+    except OSError as error:
+        raise ValueError(f"{path}: no HDF5 file that can be read: {error}") from error
+
+
+def _demos(file: Any) -> list[str]:
+    """The names of the demonstrations, demo_2 before demo_10."""
+    if "data" not in file or not len(file["data"]):
+        raise ValueError(f"{file.filename}: has no demonstrations under data/")
+    number = lambda name: int((re.findall(r"\d+", name) or ["0"])[-1])  # noqa: E731
+    return sorted(file["data"], key=lambda name: (number(name), name))
+
+
+def _dataset(file: Any, name: str, axes: int) -> Any:
+    """An HDF5 data set, unless it is missing, of another shape, too large, or stored outside the file."""
+    import h5py
+
+    where, parts = f"{file.filename}: {name}", name.split("/")
+    for i in range(1, len(parts) + 1):
+        link = file.get("/".join(parts[:i]), getlink=True)
+        if isinstance(link, h5py.ExternalLink):
+            raise ValueError(f"{where}: leads out of the file, to {link.filename}")
+    found = file.get(name)
+    if not isinstance(found, h5py.Dataset):
+        there = ", ".join(file["/".join(parts[:-1])]) if "/".join(parts[:-1]) in file else "nothing"
+        raise ValueError(f"{where}: missing, there is {there}")
+    if found.is_virtual or found.external:
+        raise ValueError(f"{where}: is stored outside the file, which is not read")
+    if found.ndim != axes or found.dtype.kind not in "fiu":
+        raise ValueError(f"{where}: got {found.dtype} {list(found.shape)}, expected numbers with {axes} axes")
+    shared.check_size(where, found.shape, found.dtype.itemsize)
+    return found
+
+
+def main(argv: list[str]) -> None:
+    """Imports PATH as OUT."""
+    shared.run(argv, lambda path, flags: Robomimic(path, flags.camera, flags.state, flags.action, flags.height))
+
+
+if __name__ == "__main__":
+    shared.define_flags(state="robot0_eef_pos,robot0_eef_quat,robot0_gripper_qpos", action="actions", task="file")
+    app.run(main)

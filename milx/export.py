@@ -1,0 +1,116 @@
+"""Writes a run's best policy as two programs that run with JAX alone, on CPU and CUDA.
+
+python -m milx.export runs/reach-mil-fast-0 exported
+
+adapt.bin, act.bin      the programs (jax.export), with nothing of milx, Flax or MuJoCo in them
+params.npz              what was learnt, whitening included
+policy.json             the shapes that the programs want
+policy.py               loads all that: `milx/exported.py`
+"""
+
+import json
+import pathlib
+import shutil
+import sys
+from typing import Any
+
+import jax
+import numpy as np
+from absl import app, flags, logging
+from jax import export as jax_export
+
+from milx import envs, exported
+from milx.config import GIVEN
+from milx.policy import Policy, load, with_goals
+from milx.types import Demo, Observation
+
+PLATFORMS = ("cpu", "cuda")
+
+
+def export(policy: Policy, out: str | pathlib.Path, shots: int = 1) -> None:
+    """Writes a policy's programs and parameters.
+
+    Args:
+        policy: from `milx.load`.
+        out: the folder; must not exist.
+        shots: K, how many demonstrations `adapt` takes.
+
+    Raises:
+        ValueError: if the folder exists.
+    """
+    folder = pathlib.Path(out)
+    if folder.exists():
+        raise ValueError(f"out: {folder} exists, expected a folder that does not")
+    sizes = input_shapes(policy, shots)
+    leaves, structure = jax.tree.flatten(policy.params)
+
+    def adapt(leaves: list[jax.Array], demo: dict[str, jax.Array]) -> list[jax.Array]:
+        params = jax.tree.unflatten(structure, leaves)
+        return jax.tree.leaves(policy.method.adapt(params, with_goals(Demo(**demo), policy.spec)))
+
+    shapes = {
+        name: {field: jax.ShapeDtypeStruct(tuple(shape), _dtype(field)) for field, shape in fields.items()}
+        for name, fields in sizes.items()
+    }
+    task_params = jax.eval_shape(
+        lambda demo: policy.method.adapt(policy.params, with_goals(Demo(**demo), policy.spec)), shapes["adapt"]
+    )
+    task_structure = jax.tree.structure(task_params)
+
+    def act(leaves: list[jax.Array], observation: dict[str, jax.Array]) -> jax.Array:
+        return policy.method.act(jax.tree.unflatten(task_structure, leaves), Observation(**observation), ())[0]
+
+    programs = {
+        "adapt": _program(adapt, leaves, shapes["adapt"]),
+        "act": _program(act, jax.tree.leaves(task_params), shapes["act"]),
+    }
+    partial = folder.with_name(f"{folder.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    for name, program in programs.items():
+        (partial / f"{name}.bin").write_bytes(program)
+    arrays: dict[str, Any] = {f"{i:04d}": np.asarray(leaf) for i, leaf in enumerate(leaves)}
+    np.savez(partial / "params.npz", **arrays)
+    (partial / "policy.json").write_text(json.dumps(sizes, indent=1) + "\n")
+    shutil.copyfile(exported.__file__, partial / "policy.py")
+    partial.rename(folder)
+
+
+def input_shapes(policy: Policy, shots: int) -> dict[str, dict[str, list[int]]]:
+    """Shapes of the fields that "adapt" and "act" take."""
+    spec, config = policy.spec, policy.config
+    horizon = config.recorded.horizon if config.recorded.path else envs.ENVS[config.env_name].horizon
+    seen = {"state": [spec.state_size]}
+    if spec.image_shape is not None:
+        seen["image"] = [*spec.image_shape, 3]
+    shown = seen | {"action": [spec.action_size]}
+    hidden = {GIVEN[0]: (), GIVEN[1]: ("action",), GIVEN[2]: ("action", "state")}[config.mil.given]
+    adapt = {name: [shots, horizon, *shape] for name, shape in shown.items() if name not in hidden}
+    return {"adapt": adapt, "act": seen}
+
+
+def _dtype(field: str) -> Any:
+    return np.uint8 if field == "image" else np.float32
+
+
+def _program(function: Any, *args: Any) -> bytes:
+    shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), args)
+    return bytes(jax_export.export(jax.jit(function), platforms=PLATFORMS)(*shapes).serialize())
+
+
+def main(argv: list[str]) -> None:
+    """Exports the run RUN to the folder OUT."""
+    if len(argv) != 3:
+        raise app.UsageError("expected two arguments, RUN and OUT")
+    logging.set_verbosity(logging.WARNING)
+    try:
+        export(load(argv[1]), argv[2], flags.FLAGS.shots)
+    except ValueError as error:
+        sys.exit(f"milx: {error}")
+    size = sum(path.stat().st_size for path in pathlib.Path(argv[2]).iterdir())
+    print(f"{argv[2]}: {size / 1e6:.1f} MB; `from policy import Policy` there")
+
+
+if __name__ == "__main__":
+    flags.DEFINE_integer("shots", 1, "Demonstrations that the exported policy adapts to.", lower_bound=1)
+    app.run(main)

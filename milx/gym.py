@@ -1,0 +1,116 @@
+"""milx's environments in Gymnasium's interface, one at a time.
+
+    env = milx.gym.GymEnv("reach", split="test")
+    observation, info = env.reset(seed=0)
+    demo = env.demonstrate()  # of the same task, in another scene: what a policy adapts to
+    observation, reward, terminated, truncated, info = env.step(action)
+
+For thousands of episodes at once use the environment itself (`milx.make`), under `jax.vmap`.
+"""
+
+from typing import Any, SupportsFloat
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+from gymnasium import spaces
+
+from milx import envs
+from milx.config import DataConfig, make_config
+from milx.data.demos import render_demo
+from milx.envs.base import State
+from milx.trajopt.expert import perform
+from milx.trajopt.ilqr import Options
+from milx.types import Demo
+
+
+class GymEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
+    """An environment of milx. An episode never terminates; it is truncated at the environment's horizon.
+
+    Observations are dictionaries of "state" float32 [S] and, where policies see pixels, "image" uint8 [H, W, 3]. The
+    reward of a step is minus the experts' running cost. After the last step `info["is_success"]` tells whether the
+    episode succeeded.
+
+    Args:
+        name: a key of `milx.ENVS`.
+        split: whose tasks are drawn: "train", "validation" or "test".
+        image_shape: (H, W) in pixels; the published experiment's if None.
+        render_mode: "rgb_array" or None.
+
+    Raises:
+        ValueError: for a name, split or render mode that does not exist.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012
+
+    def __init__(
+        self,
+        name: str = "reach",
+        split: str = "train",
+        image_shape: tuple[int, int] | None = None,
+        render_mode: str | None = None,
+    ):
+        if split not in envs.SPLITS:
+            raise ValueError(f"split: got {split!r}, expected one of {', '.join(envs.SPLITS)}")
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ValueError(f"render_mode: got {render_mode!r}, expected None or 'rgb_array'")
+        self.env, self.split, self.render_mode = envs.make(name, image_shape), split, render_mode
+        low, high = (np.asarray(limit, np.float32) for limit in self.env.action_range)
+        self.action_space = spaces.Box(low, high)
+        self._seen: dict[str, spaces.Space] = {"state": spaces.Box(-np.inf, np.inf, (self.env.state_size,))}
+        if self.env.vision:
+            self._seen["image"] = spaces.Box(0, 255, (*self.env.image_shape, 3), np.uint8)
+        self.observation_space = spaces.Dict(self._seen)  # type: ignore[assignment]
+        self._task: Any = None
+        self._states: list[State] = []
+        self._draw = jax.jit(lambda key: self.env.sample_task(key, split))
+        self._reset, self._render = jax.jit(self.env.reset), jax.jit(self.env.render)
+        self._success = jax.jit(self.env.success)
+        self._cost = jax.jit(lambda *args: 0.5 * jnp.square(self.env.running_residual(*args)).sum())
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Draws a task and a scene; with options={"same_task": True} only a scene."""
+        super().reset(seed=seed)
+        if self._task is None or not (options or {}).get("same_task", False):
+            self._task = self._draw(self._key())
+        self._states = [self._reset(self._key(), self._task)]
+        return self._observe(), {}
+
+    def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], SupportsFloat, bool, bool, dict[str, Any]]:
+        """Acts for one time step."""
+        t, state, chosen = len(self._states) - 1, self._states[-1], jnp.asarray(action, jnp.float32)
+        cost = self._cost(self._task, state, chosen, jnp.asarray(t))
+        self._states.append(self.env.step(self._task, state, chosen))
+        truncated, info = len(self._states) > self.env.horizon, {}
+        if truncated:
+            states = jax.tree.map(lambda *x: jnp.stack(x), *self._states[: self.env.horizon + 1])
+            info["is_success"] = bool(self._success(self._task, states))
+        return self._observe(), -float(cost), False, truncated, info
+
+    def render(self) -> np.ndarray | None:  # type: ignore[override]
+        """[H, W, 3] uint8, what the camera sees."""
+        return None if self.render_mode is None else np.asarray(self._render(self._task, self._states[-1]))
+
+    def demonstrate(self, config: DataConfig | None = None) -> Demo:
+        """An expert's demonstration of the current task in another scene: [T, ...], NumPy.
+
+        Args:
+            config: how to plan; that of the preset `fast` if None.
+        """
+        config = config or make_config(self.env.name, preset="fast").data
+        scene = self._reset(self._key(), self._task)
+        batch = jax.tree.map(lambda x: x[None], (self._task, scene, self._key()))
+        planned = perform(self.env, *batch, Options(iterations=config.plan_iterations), config.noise)
+        states, action = jax.tree.map(lambda x: x[0], planned)
+        return jax.tree.map(np.asarray, jax.jit(render_demo, static_argnums=0)(self.env, self._task, states, action))
+
+    def _key(self) -> jax.Array:
+        return jax.random.key(int(self.np_random.integers(2**31)))
+
+    def _observe(self) -> dict[str, np.ndarray]:
+        seen = self.env.observe(self._task, self._states[-1])
+        values = {"image": seen.image, "state": seen.state}
+        return {name: np.asarray(values[name], space.dtype) for name, space in self._seen.items()}

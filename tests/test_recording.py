@@ -1,0 +1,163 @@
+"""A run on recorded demonstrations, from importing to a policy: the demonstrations are of tasks with a known answer."""
+
+import dataclasses
+import io
+import json
+
+import jax
+import numpy as np
+import pytest
+from rich.console import Console
+from tiny import QUIET
+
+import milx
+from milx import recording, runs
+from milx.data.dataset import DataSet, Writer
+from milx.recording import RecordedRun
+from milx.types import Demo
+
+HORIZON = 8
+MEAN, SPREAD = np.array([3.0, -1.0]), np.array([2.0, 0.1])
+"""Of the actions, of very different sizes."""
+
+
+def random_demo(rng, direction, length):
+    """Images of a task's colour; actions along its direction, and on the state."""
+    state = rng.normal(size=(length, 3)).astype(np.float32)
+    color = np.uint8(128 + 100 * np.append(direction, 0.0))
+    image = np.broadcast_to(color, (length, 12, 16, 3))
+    action = MEAN + SPREAD * (1.5 * direction + 0.5 * state[:, :2])
+    return Demo(image, state, action.astype(np.float32))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """40 tasks, each a direction, with 3 demonstrations of 7 to 12 steps."""
+    folder, rng = tmp_path_factory.mktemp("recording") / "set", np.random.default_rng(0)
+    with Writer(folder, (12, 16), 3, 2, "a test") as writer:
+        for task in range(40):
+            angle = rng.uniform(0, 2 * np.pi)
+            direction = np.array([np.cos(angle), np.sin(angle)])
+            demos = [random_demo(rng, direction, length) for length in rng.integers(7, 13, 3)]
+            split = "validation" if task < 4 else "test" if task < 10 else "train"
+            writer.add(f"direction {task}", split, [len(demo.state) for demo in demos], demos)
+    return folder
+
+
+def tiny_config(folder):
+    config = recording.make_config(folder, preset="cpu")
+    config.recorded.horizon = HORIZON
+    config.network.filters, config.network.strides, config.network.fc_layers = (4, 4), (2, 1), (40, 40)
+    config.train.steps, config.train.log_every, config.train.eval_every = 600, 100, 200
+    config.train.meta_batch, config.optimizer.learning_rate = 8, 3e-3
+    return config
+
+
+@pytest.fixture(scope="module")
+def trained(cache, folder, tmp_path_factory):
+    run = runs.make(tiny_config(folder), tmp_path_factory.mktemp("run"), QUIET)
+    run.train()
+    return run, run.evaluate()
+
+
+def test_held_out_tasks_are_learnt_from_their_demonstration(trained):
+    """The direction is the task; its share of the actions' variance is 1.5^2/2 of 1.5^2/2 + 0.5^2."""
+    run, result = trained
+    errors = result["action_error"]
+    assert errors["tasks"] == 6
+    assert errors["mean_action"] == pytest.approx(1, abs=0.25)
+    assert errors["after"] < 0.4 * errors["before"]
+    assert errors["other_task"] > errors["mean_action"]
+    assert result["score"] == pytest.approx(1 - errors["after"] / errors["mean_action"])
+    lines = [json.loads(line) for line in (run.folder / "metrics.jsonl").open()]
+    scores = [line["validation_score"] for line in lines if "validation_score" in line]
+    assert len(scores) == 3
+    assert max(scores) > 0.5
+    assert (run.folder / "learning_curve.png").stat().st_size > 1000
+
+
+def read_resampled(data, task):
+    steps = [np.linspace(0, length - 1, HORIZON).round().astype(int) for length in data.header.tasks[task].lengths]
+    return [data.read(task, i, index) for i, index in enumerate(steps)]
+
+
+def test_errors_are_those_of_a_loop_over_demonstrations(trained, folder):
+    """What the run reports, worked out with the policy that users load, step by step."""
+    run, result = trained
+    policy, data = milx.load(run.folder), DataSet(folder)
+    training = recording.read_vectors(data, data.header.of_split("train"), HORIZON).action
+    errors = []
+    for task in data.header.of_split("test"):
+        demos = read_resampled(data, task)
+        task_params = policy.adapt(policy.params, demos[0])
+        for query in demos[1:]:
+            for image, state, action in zip(query.image, query.state, query.action, strict=True):
+                found = np.asarray(policy.act(task_params, milx.Observation(image, state)))
+                errors.append(np.mean(((found - action) / training.std(axis=0)) ** 2))
+    assert np.mean(errors) == pytest.approx(result["action_error"]["after"], rel=1e-4)
+
+
+def test_whitening_is_fitted_to_the_training_tasks_alone(trained, folder):
+    run, _ = trained
+    data = DataSet(folder)
+    rows = [demo for task in data.header.of_split("train") for demo in read_resampled(data, task)]
+    whitening = milx.load(run.folder).params["whitening"]
+    for field in ("state", "action"):
+        values = np.concatenate([getattr(row, field) for row in rows])
+        np.testing.assert_allclose(getattr(whitening, f"{field}_mean"), values.mean(axis=0), rtol=1e-4, atol=1e-4)
+        np.testing.assert_allclose(getattr(whitening, f"{field}_scale"), values.std(axis=0), rtol=1e-4)
+
+
+def test_an_interrupted_run_ends_bit_for_bit_like_the_uninterrupted_one(trained, folder, tmp_path, monkeypatch):
+    """Also when the data passes by in shards, of which none is whole."""
+    config = tiny_config(folder)
+    config.train.steps, config.train.eval_every = 200, 100
+    size = 3 * HORIZON * (12 * 16 * 3 + 4 * 5) * 1.01
+    config.recorded.gib = 4 * size / 2**30
+
+    def final(folder):
+        run = RecordedRun(config, folder, QUIET)
+        assert run.shards.num_tasks == 4
+        run.train()
+        return milx.load(folder).params
+
+    with monkeypatch.context() as patch:
+        validate = RecordedRun._validate
+
+        def stop(self, params):
+            patch.setattr(RecordedRun, "_validate", interrupt)
+            return validate(self, params)
+
+        def interrupt(self, params):
+            raise KeyboardInterrupt
+
+        patch.setattr(RecordedRun, "_validate", stop)
+        with pytest.raises(KeyboardInterrupt):
+            final(tmp_path / "stopped")
+    stopped, straight = final(tmp_path / "stopped"), final(tmp_path / "straight")
+    jax.tree.map(np.testing.assert_array_equal, stopped, straight)
+
+
+def test_bad_data_is_refused_before_anything_is_compiled(folder, tmp_path):
+    config = tiny_config(folder)
+    for change, message in (
+        ({"path": str(tmp_path)}, "data: .* has no zarr.json, expected a folder written by milx.data"),
+        ({"goal_indices": (3,)}, r"recorded.goal_indices: got 3, expected less than 3"),
+        ({"horizon": 0}, r"recorded.horizon: got 0, expected at least 1"),
+        ({"gib": 1e-9}, r"recorded.gib: got 1e-09, expected at least"),
+    ):
+        bad = dataclasses.replace(config, recorded=dataclasses.replace(config.recorded, **change))
+        with pytest.raises(ValueError, match=message):
+            RecordedRun(bad, tmp_path / "run", QUIET)
+    config.train.shots = 3
+    with pytest.raises(ValueError, match=r"expected at least one with more than train.shots = 3 demonstrations"):
+        RecordedRun(config, tmp_path / "run", QUIET)
+
+
+def test_the_report_names_the_floors(trained):
+    run, result = trained
+    run.console = Console(record=True, width=200, file=io.StringIO())
+    run.report(result)
+    text = run.console.export_text()
+    assert f"{result['action_error']['after']:.3f}" in text
+    assert f"mean action {result['action_error']['mean_action']:.3f}" in text
