@@ -95,6 +95,7 @@ class Robomimic:
             return Demo(image, np.concatenate(states, axis=1) if states else None, action)
 
     def _only_camera(self, file: Any, demo: str) -> str:
+        _check_links(file, f"data/{demo}/obs")
         cameras = [name for name in file.get(f"data/{demo}/obs", {}) if name.endswith("_image")]
         if len(cameras) > 1:
             raise ValueError(f"camera: expected one of {', '.join(cameras)}, or none with --camera=")
@@ -114,7 +115,8 @@ def _open(path: pathlib.Path) -> Any:
 
 def _demos(file: Any) -> list[str]:
     """The names of the demonstrations, demo_2 before demo_10."""
-    if "data" not in file or not len(file["data"]):
+    _check_links(file, "data")
+    if not len(file.get("data", {})):
         raise ValueError(f"{file.filename}: has no demonstrations under data/")
     number = lambda name: int((re.findall(r"\d+", name) or ["0"])[-1])  # noqa: E731
     return sorted(file["data"], key=lambda name: (number(name), name))
@@ -124,14 +126,10 @@ def _dataset(file: Any, name: str, axes: int) -> Any:
     """An HDF5 data set, unless it is missing, of another shape, too large, or stored outside the file."""
     import h5py
 
-    where, parts = f"{file.filename}: {name}", name.split("/")
-    for i in range(1, len(parts) + 1):
-        link = file.get("/".join(parts[:i]), getlink=True)
-        if isinstance(link, h5py.ExternalLink):
-            raise ValueError(f"{where}: leads out of the file, to {link.filename}")
-    found = file.get(name)
+    _check_links(file, name)
+    where, found = f"{file.filename}: {name}", file.get(name)
     if not isinstance(found, h5py.Dataset):
-        there = ", ".join(file["/".join(parts[:-1])]) if "/".join(parts[:-1]) in file else "nothing"
+        there = ", ".join(file.get(name.rpartition("/")[0], {})) or "nothing"
         raise ValueError(f"{where}: missing, there is {there}")
     if found.is_virtual or found.external:
         raise ValueError(f"{where}: is stored outside the file, which is not read")
@@ -139,6 +137,17 @@ def _dataset(file: Any, name: str, axes: int) -> Any:
         raise ValueError(f"{where}: got {found.dtype} {list(found.shape)}, expected numbers with {axes} axes")
     shared.check_size(where, found.shape, found.dtype.itemsize)
     return found
+
+
+def _check_links(file: Any, name: str) -> None:
+    """Raises ValueError if the way to `name` leads through another file."""
+    import h5py
+
+    parts = name.split("/")
+    for i in range(1, len(parts) + 1):
+        link = file.get("/".join(parts[:i]), getlink=True)
+        if isinstance(link, h5py.ExternalLink):
+            raise ValueError(f"{file.filename}: {name}: leads out of the file, to {link.filename}")
 
 
 def main(argv: list[str]) -> None:

@@ -1,0 +1,102 @@
+"""The check of a data set says what will go wrong, and nothing where all is well."""
+
+import dataclasses
+import io
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from milx.data import check
+from milx.data.dataset import DataSet, Writer
+from milx.data.episodes import split_tasks
+from milx.types import Demo
+
+RNG = np.random.default_rng(0)
+
+
+def good(length=10):
+    image = RNG.integers(0, 256, (length, 8, 8, 3), np.uint8)
+    return Demo(image, RNG.normal(size=(length, 2)), RNG.normal(size=(length, 2)))
+
+
+def write(folder, tasks, image_shape=(8, 8)):
+    with Writer(folder, image_shape, 2, 2, "a test") as writer:
+        for i, (split, demos) in enumerate(tasks):
+            writer.add(f"task {i}", split, [len(demo.state) for demo in demos], demos)
+    return DataSet(folder)
+
+
+def well():
+    return [("train", [good(), good()]), ("validation", [good(), good()]), ("test", [good(), good()])]
+
+
+def with_column(demo, field, column, value):
+    array = getattr(demo, field).copy()
+    array[:, column] = value
+    return dataclasses.replace(demo, **{field: array})
+
+
+def test_nothing_is_wrong_with_a_good_set(tmp_path):
+    assert check.problems(write(tmp_path / "set", well())) == []
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        (lambda tasks: tasks.pop(), "no test tasks"),
+        (lambda tasks: tasks[0][1].pop(), "task 'task 0' has 1 demonstration: one more must be the query"),
+        (
+            lambda tasks: tasks.__setitem__(0, ("train", [dataclasses.replace(d, action=None) for d in tasks[0][1]])),
+            "task 'task 0' shows no actions: it cannot be learnt from",
+        ),
+        (lambda tasks: tasks[1][1].append(good(31)), "lengths from 10 to 31 steps"),
+        (lambda tasks: tasks[2][1].append(with_column(good(), "state", 1, np.nan)), "state: 10 values are not finite"),
+        (
+            lambda tasks: [
+                demos.__setitem__(i, with_column(d, "action", 0, 4.0))
+                for _, demos in tasks
+                for i, d in enumerate(demos)
+            ],
+            "action[0] is constant: it says nothing",
+        ),
+        (
+            lambda tasks: tasks[0][1].__setitem__(
+                0, dataclasses.replace(good(), image=np.full((10, 8, 8, 3), 7, np.uint8))
+            ),
+            "task 'task 0': the first image is of one colour",
+        ),
+    ],
+)
+def test_what_will_go_wrong_is_said(tmp_path, change, problem):
+    tasks = well()
+    change(tasks)
+    found = check.problems(write(tmp_path / "set", tasks))
+    assert any(line.startswith(problem) for line in found), found
+    assert len(found) == 1
+
+
+def test_the_description_counts_and_measures(tmp_path):
+    data = write(tmp_path / "set", [*well(), ("train", [good(12)] * 3)])
+    console = Console(record=True, width=150, file=io.StringIO())
+    check.describe(data, console)
+    text = console.export_text()
+    assert "4 tasks, 9 demonstrations, from a test" in text
+    assert "images 8 x 8; 10 to 12 steps" in text
+    assert "train: 2 tasks: task 0, task 3" in text
+    column = check.vectors(data)["action"][:, 1]
+    row = next(line for line in text.splitlines() if "action[1]" in line)
+    numbers = [float(cell) for cell in row.replace("│", " ").split()[1:]]
+    np.testing.assert_allclose(numbers, [column.min(), column.mean(), column.max(), column.std()], rtol=1e-3)
+
+
+def test_splits_depend_on_names_alone_and_have_their_sizes():
+    names = [f"task {i}" for i in range(50)]
+    first, again = split_tasks(names, 0.1, 0.2), split_tasks(names[::-1], 0.1, 0.2)
+    assert first == again
+    counts = {split: list(first.values()).count(split) for split in ("train", "validation", "test")}
+    assert counts == {"train": 35, "validation": 5, "test": 10}
+    assert list(first.values()) != sorted(first.values())
+    for parts, message in (((-0.1, 0.1), "validation: got -0.1"), ((0.5, 0.5), r"validation \+ test: got 1.0")):
+        with pytest.raises(ValueError, match=message):
+            split_tasks(names, *parts)

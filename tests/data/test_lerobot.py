@@ -1,0 +1,183 @@
+"""LeRobot's data sets: one that the real writer wrote, and damaged or hostile copies of it."""
+
+import json
+import pathlib
+import shutil
+import sys
+
+import numpy as np
+import pyarrow.parquet
+import pytest
+
+from milx.data import check, episodes, lerobot
+from milx.data.dataset import DataSet
+from milx.data.lerobot import LeRobot
+
+FIXTURES = pathlib.Path(__file__).parents[1] / "fixtures"
+sys.path.insert(0, str(FIXTURES))
+import make_lerobot  # noqa: E402
+
+ROOT = FIXTURES / "lerobot"
+TOP, WRIST = "observation.images.top", "observation.images.wrist"
+
+
+def open_set(root=ROOT, camera=TOP, state="observation.state", action="action", height=128):
+    return LeRobot(root, camera, state, action, height)
+
+
+@pytest.fixture
+def copy(tmp_path):
+    """A copy of the fixture that a test may damage."""
+    return pathlib.Path(shutil.copytree(ROOT, tmp_path / "copy"))
+
+
+def change_info(root, **changes):
+    path = root / "meta" / "info.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
+
+
+def change_episodes(root, column, value):
+    path = root / "meta/episodes/chunk-000/file-000.parquet"
+    table = pyarrow.parquet.read_table(path)
+    index = table.column_names.index(column)
+    field = table.schema.field(index)
+    pyarrow.parquet.write_table(table.set_column(index, field, pyarrow.array([value] * len(table), field.type)), path)
+
+
+def expected(episode, camera):
+    """[T, ...] images, states and actions as the script made them."""
+    steps = range(make_lerobot.EPISODES[episode][1])
+    top, wrist, state, action = map(np.stack, zip(*(make_lerobot.frame(episode, t) for t in steps), strict=True))
+    return (top if camera == TOP else wrist), state, action
+
+
+@pytest.mark.parametrize("camera", [TOP, WRIST])
+def test_every_episode_is_read_as_it_was_written(camera):
+    """Frames of the video belong to the same steps as states and actions, in whichever file they lie."""
+    found = open_set(camera=camera).episodes("task_index")
+    assert [(e.task, e.length) for e in found] == [(make_lerobot.TASKS[t], n) for t, n in make_lerobot.EPISODES]
+    for number, episode in enumerate(found):
+        image, state, action = expected(number, camera)
+        demo = episode.read()
+        np.testing.assert_array_equal(demo.state, state)
+        np.testing.assert_array_equal(demo.action, action)
+        # Video is lossy, and worst where the halves meet; neighbouring steps differ by 15.
+        error = np.abs(demo.image.astype(int) - image)
+        assert error[:, :, [5, -5]].max() < (7 if camera == TOP else 1)
+
+
+def test_an_import_is_a_data_set(tmp_path):
+    source = open_set(height=24)
+    episodes.write(tmp_path / "out", source.episodes("task_index"), source.sizes, (0.3, 0.4), "there")
+    data = DataSet(tmp_path / "out")
+    assert data.header.image_shape == (24, 32)
+    assert [task.name for task in data.header.tasks] == sorted(make_lerobot.TASKS)
+    assert sorted(task.split for task in data.header.tasks) == ["test", "train", "validation"]
+    for i, task in enumerate(data.header.tasks):
+        own = [n for n, (t, _) in enumerate(make_lerobot.EPISODES) if make_lerobot.TASKS[t] == task.name]
+        for j, episode in enumerate(own):
+            image, state, action = expected(episode, TOP)
+            demo = data.read(i, j)
+            np.testing.assert_array_equal(demo.state, state)
+            np.testing.assert_array_equal(demo.action, action)
+            halved = image.reshape(len(image), 24, 2, 32, 2, 3).mean(axis=(2, 4))
+            assert np.abs(demo.image - halved)[:, :, [3, -3]].max() < 7
+    problems = " ".join(check.problems(data))
+    assert "state[3] is constant" in problems
+    assert "action[2] is constant" in problems
+    assert "first image is of one colour" in problems, "that of the first episode"
+
+
+def test_files_or_a_mapping_make_tasks(tmp_path):
+    by_file = [episode.task for episode in open_set().episodes("file")]
+    assert by_file[:4] == ["data/chunk-000/file-000.parquet"] * 2 + ["data/chunk-000/file-001.parquet"] * 2
+    path = tmp_path / "tasks.json"
+    path.write_text(json.dumps({str(i): "even" if i % 2 == 0 else "odd" for i in range(9)}))
+    assert [episode.task for episode in open_set().episodes(str(path))] == ["even", "odd"] * 4 + ["even"]
+    path.write_text(json.dumps({"0": "even"}))
+    with pytest.raises(ValueError, match="does not say to which task episode '1' belongs"):
+        open_set().episodes(str(path))
+
+
+def test_states_and_actions_may_lack():
+    source = open_set(camera="", action="")
+    assert source.sizes == (None, 4, 0)
+    (demo,) = (episode.read() for episode in source.episodes("task_index")[:1])
+    assert demo.image is None
+    assert demo.action is None
+    assert open_set(state="").sizes.state == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"camera": None}, f"camera: expected one of {TOP}, {WRIST}"),
+        ({"camera": "front"}, "feature: got 'front', expected one of observation.state"),
+        ({"camera": "action"}, r"feature 'action': got float32 \[3\], expected video or image with 3 axes"),
+        ({"state": TOP}, "expected float32 or float64 or int64 with 1 axes"),
+    ],
+)
+def test_features_that_do_not_fit_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        open_set(**arguments)
+
+
+def test_older_versions_name_the_converter(copy):
+    change_info(copy, codebase_version="v2.1")
+    with pytest.raises(
+        ValueError, match=r"codebase_version: got v2.1, expected v3.0; convert it with `python -m lerobot"
+    ):
+        open_set(copy)
+    change_info(copy, codebase_version="v4.0")
+    with pytest.raises(ValueError, match=r"codebase_version: got v4\.0, expected v3\.0"):
+        open_set(copy)
+
+
+@pytest.mark.parametrize("path", ["../../secret.parquet", "/etc/passwd", "{chunk_index.__class__}.parquet", "linked"])
+def test_nothing_outside_the_folder_is_read(copy, path):
+    """Neither by "..", nor by absolute paths, nor by links, and templates are no Python."""
+    shutil.copy(ROOT / "data/chunk-000/file-000.parquet", copy.parent / "secret.parquet")
+    (copy / "linked").symlink_to(copy.parent / "secret.parquet")
+    change_info(copy, data_path=path)
+    with pytest.raises(ValueError, match=r"leads out of the data set's folder|is missing"):
+        open_set(copy).episodes("task_index")
+    outside = "videos/../../../" + "x" * 3
+    change_info(copy, data_path="data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet", video_path=outside)
+    with pytest.raises(ValueError, match="leads out of the data set's folder"):
+        open_set(copy).episodes("task_index")[0].read()
+
+
+def test_a_linked_episodes_folder_is_not_followed(copy):
+    shutil.move(copy / "meta/episodes/chunk-000", copy.parent / "elsewhere")
+    (copy / "meta/episodes/chunk-000").symlink_to(copy.parent / "elsewhere")
+    with pytest.raises(ValueError, match="leads out of the data set's folder"):
+        open_set(copy).episodes("task_index")
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda root: (root / "meta/info.json").write_text("{"), "not LeRobot's metadata"),
+        (lambda root: (root / "meta/info.json").unlink(), "has no meta/info.json, expected a LeRobot data set"),
+        (lambda root: shutil.rmtree(root / "meta/episodes"), "meta/episodes holds no episodes"),
+        (lambda root: change_info(root, fps=0), "features or fps: not as in"),
+        (
+            lambda root: (root / "data/chunk-000/file-000.parquet").write_bytes(b"PAR1"),
+            "no parquet file that can be read",
+        ),
+        (
+            lambda root: (root / f"videos/{TOP}/chunk-000/file-000.mp4").write_bytes(b"x" * 99),
+            "no video that can be read",
+        ),
+        (lambda root: (root / f"videos/{TOP}/chunk-000/file-000.mp4").unlink(), "file-000.mp4 is missing"),
+        (lambda root: change_episodes(root, f"videos/{TOP}/from_timestamp", 60.0), "has no frame at 60.000 s"),
+        (lambda root: change_episodes(root, "length", 10**6), "got 12 rows of episode 0, expected 1000000"),
+        (lambda root: change_episodes(root, "length", 0), "length: got 0, expected > 0"),
+        (lambda root: change_episodes(root, "tasks", []), "episode 0 has no task"),
+    ],
+)
+def test_damaged_sets_are_refused(copy, damage, message):
+    lerobot._read_table.cache_clear()
+    damage(copy)
+    with pytest.raises(ValueError, match=message):
+        open_set(copy).episodes("task_index")[0].read()

@@ -1,0 +1,121 @@
+"""Files in robomimic's layout, and damaged or hostile ones."""
+
+import pathlib
+import shutil
+import sys
+
+import h5py
+import numpy as np
+import pytest
+
+from milx.data import episodes
+from milx.data.dataset import DataSet
+from milx.data.robomimic import Robomimic
+
+FIXTURES = pathlib.Path(__file__).parents[1] / "fixtures"
+sys.path.insert(0, str(FIXTURES))
+import make_robomimic  # noqa: E402
+
+STATE = "robot0_eef_pos,robot0_gripper_qpos"
+
+
+def open_set(path=FIXTURES / "robomimic", camera=None, state=STATE, action="actions", height=128):
+    return Robomimic(path, camera, state, action, height)
+
+
+@pytest.fixture
+def copy(tmp_path):
+    return pathlib.Path(shutil.copy(FIXTURES / "robomimic" / "lift.hdf5", tmp_path / "lift.hdf5"))
+
+
+def test_an_import_is_a_data_set(tmp_path):
+    """A task for each file, demonstrations in the order of their numbers, states side by side."""
+    source = open_set(height=10)
+    episodes.write(tmp_path / "out", source.episodes("file"), source.sizes, (0.0, 0.5), "there")
+    data = DataSet(tmp_path / "out")
+    assert [task.name for task in data.header.tasks] == ["lift", "stack"]
+    assert sorted(task.split for task in data.header.tasks) == ["test", "train"]
+    for i, task in enumerate(data.header.tasks):
+        lengths = make_robomimic.LENGTHS[task.name]
+        for j, demo in enumerate(sorted(lengths)):
+            steps = [make_robomimic.step(task.name, demo, t) for t in range(lengths[demo])]
+            image, eef, grip, action = map(np.stack, zip(*steps, strict=True))
+            read = data.read(i, j)
+            np.testing.assert_allclose(read.state, np.concatenate([eef, grip], axis=1), rtol=1e-6)
+            np.testing.assert_allclose(read.action, action, rtol=1e-6)
+            halved = image.reshape(len(image), 10, 2, 15, 2, 3).mean(axis=(2, 4))
+            assert np.abs(read.image - halved).max() <= 1
+
+
+def test_a_single_file_and_a_mapping(tmp_path):
+    path = tmp_path / "tasks.json"
+    path.write_text('{"lift/demo_0": "a", "lift/demo_1": "b", "lift/demo_2": "a", "lift/demo_10": "b"}')
+    found = open_set(FIXTURES / "robomimic" / "lift.hdf5").episodes(str(path))
+    assert [(e.task, e.length) for e in found] == [("a", 7), ("b", 9), ("a", 6), ("b", 8)]
+
+
+def replace(path, name, value):
+    with h5py.File(path, "a") as file:
+        del file[name]
+        if value is not None:
+            file[name] = value
+
+
+def virtual(path):
+    layout = h5py.VirtualLayout((7, 4), float)
+    layout[:] = h5py.VirtualSource("/etc/passwd", "actions", (7, 4))
+    with h5py.File(path, "a") as file:
+        del file["data/demo_0/actions"]
+        file.create_virtual_dataset("data/demo_0/actions", layout)
+
+
+def external(path):
+    with h5py.File(path, "a") as file:
+        del file["data/demo_0/actions"]
+        file.create_dataset("data/demo_0/actions", (7, 4), float, external=[("/etc/passwd", 0, 224)])
+
+
+def enormous(path):
+    with h5py.File(path, "a") as file:
+        del file["data/demo_0/actions"]
+        file.create_dataset("data/demo_0/actions", (10**9, 4), float, chunks=(1000, 4))
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda path: path.write_bytes(b"HDF"), "no HDF5 file that can be read"),
+        (lambda path: replace(path, "data/demo_0/actions", None), "data/demo_0/actions: missing, there is"),
+        (
+            lambda path: replace(path, "data/demo_0/actions", np.zeros((7, 2, 2))),
+            r"got float64 \[7, 2, 2\], expected numbers",
+        ),
+        (lambda path: replace(path, "data/demo_0/actions", np.zeros((6, 4))), "got lengths"),
+        (lambda path: replace(path, "data/demo_0/obs/agentview_image", np.zeros((7, 20, 30, 3))), "expected uint8"),
+        (lambda path: replace(path, "data", h5py.ExternalLink("/etc/passwd", "/")), "data: leads out of the file"),
+        (
+            lambda path: replace(path, "data/demo_0/actions", h5py.ExternalLink("../x.hdf5", "/a")),
+            "leads out of the file",
+        ),
+        (virtual, "is stored outside the file"),
+        (external, "is stored outside the file"),
+        (enormous, r"got shape \[1000000000, 4\], 29.8 GiB, expected at most 8"),
+    ],
+)
+def test_damaged_and_hostile_files_are_refused(copy, damage, message):
+    damage(copy)
+    with pytest.raises(ValueError, match=message):
+        open_set(copy).episodes("file")[0].read()
+
+
+def test_observations_that_do_not_exist_are_named(copy, tmp_path):
+    with pytest.raises(
+        ValueError, match="obs/wrist: missing, there is agentview_image, robot0_eef_pos, robot0_gripper"
+    ):
+        open_set(copy, state="wrist")
+    with pytest.raises(ValueError, match=r"expected a file in robomimic's layout, or a folder of \*.hdf5 files"):
+        open_set(tmp_path / "none")
+    with h5py.File(copy, "a") as file:
+        file["data/demo_0/obs/wrist_image"] = np.zeros((7, 2, 2, 3), np.uint8)
+    with pytest.raises(ValueError, match="camera: expected one of agentview_image, wrist_image"):
+        open_set(copy)
