@@ -21,7 +21,8 @@ from jax import export as jax_export
 
 from milx import envs, exported
 from milx.config import GIVEN
-from milx.policy import Policy, load, with_goals
+from milx.policy import Policy, with_goals
+from milx.pretrained import load
 from milx.types import Demo, Observation
 
 PLATFORMS = ("cpu", "cuda")

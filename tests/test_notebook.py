@@ -1,5 +1,6 @@
-"""The notebook runs from top to bottom, at tiny sizes, and is stored without outputs."""
+"""The notebooks run from top to bottom, at tiny sizes, and are stored without outputs."""
 
+import ast
 import base64
 import io
 import pathlib
@@ -12,23 +13,34 @@ import numpy as np
 import pytest
 from nbclient import NotebookClient
 
+NAMES = ("after", "before", "mean_action", "other_task")
 NOTEBOOKS = pathlib.Path(__file__).parents[1] / "experiments" / "notebooks"
-PATH = NOTEBOOKS / "quickstart.ipynb"
 
 
 @pytest.fixture(scope="module")
-def executed(cache, tmp_path_factory):
-    notebook, folder = nbformat.read(PATH, as_version=4), str(tmp_path_factory.mktemp("notebook"))
-    client = NotebookClient(notebook, timeout=900, resources={"metadata": {"path": folder}})
-    # The kernel of the environment that runs the tests, whatever else is installed.
-    client.create_kernel_manager()
-    client.km.kernel_spec.argv[0] = sys.executable
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("TMPDIR", folder)
-        patch.setenv("MILX_NOTEBOOK_STEPS", "4")
-        patch.setenv("MILX_NOTEBOOK_TASKS", "2")
-        client.execute()
-    return notebook
+def execute(cache, tmp_path_factory):
+    """Runs a notebook with so many meta-updates and tasks; returns it with its outputs."""
+
+    def run(name, steps, tasks):
+        notebook = nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4)
+        folder = str(tmp_path_factory.mktemp("notebook"))
+        client = NotebookClient(notebook, timeout=900, resources={"metadata": {"path": folder}})
+        # The kernel of the environment that runs the tests, whatever else is installed.
+        client.create_kernel_manager()
+        client.km.kernel_spec.argv[0] = sys.executable
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv("TMPDIR", folder)
+            patch.setenv("MILX_NOTEBOOK_STEPS", str(steps))
+            patch.setenv("MILX_NOTEBOOK_TASKS", str(tasks))
+            client.execute()
+        return notebook
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def executed(execute):
+    return execute("quickstart", steps=4, tasks=2)
 
 
 def code(notebook):
@@ -42,7 +54,7 @@ def printed(notebook):
 
 def test_notebooks_are_stored_clean():
     paths = sorted(NOTEBOOKS.glob("*.ipynb"))
-    assert PATH in paths
+    assert len(paths) == 3
     for path in paths:
         assert not re.search(r"/(work|root|home|tmp|Users)/", path.read_text()), path
         for cell in code(nbformat.read(path, as_version=4)):
@@ -51,7 +63,8 @@ def test_notebooks_are_stored_clean():
 
 
 def test_first_code_cell_tells_how_to_install():
-    assert "# %pip install milx" in code(nbformat.read(PATH, as_version=4))[0].source.splitlines()
+    for path in NOTEBOOKS.glob("*.ipynb"):
+        assert re.search(r'^# %pip install "?milx', code(nbformat.read(path, as_version=4))[0].source, re.MULTILINE)
 
 
 def test_last_output_shows_the_demonstration_beside_another_rollout(executed):
@@ -80,3 +93,24 @@ def test_training_and_adaptation_did_something(executed):
     }
     assert all(action.shape == (2,) and np.isfinite(action).all() for action in actions.values())
     assert np.abs(actions["after adapting"] - actions["before adapting"]).max() > 1e-6
+
+
+def test_a_task_of_ones_own_is_planned_trained_and_judged(execute):
+    notebook = execute("train_your_own_task", steps=4, tasks=2)
+    found = re.search(r"success ([\d.]+)% of 8 trials; floors and ceiling: (\{.*\})", printed(notebook))
+    assert 0 <= float(found.group(1)) <= 100
+    assert set(ast.literal_eval(found.group(2))) == {"random", "task_blind", "expert"}
+    (scene,) = code(notebook)[5].outputs
+    image = iio.imread(base64.b64decode(scene.data["image/png"]))
+    rows, columns = np.nonzero((image == 255).all(axis=-1))
+    assert (np.ptp(rows), np.ptp(columns)) == (4, 4), "the mark"
+
+
+def test_demonstrations_of_ones_own_are_learnt_from(execute):
+    """Their answer is known: what is adapted to a demonstration must beat what is adapted to another task's."""
+    text = printed(execute("bring_your_own_demonstrations", steps=400, tasks=0))
+    errors = {name: float(re.search(rf"^{name} +([\d.]+)", text, re.MULTILINE).group(1)) for name in NAMES}
+    assert errors["after"] < 0.5 * errors["before"]
+    assert errors["other_task"] > errors["mean_action"]
+    assert "'adapt.bin'" in text
+    assert re.search(r"exported policy: \[", text)

@@ -1,0 +1,41 @@
+"""The how-tos are true: their Python blocks run from top to bottom, and their commands exist."""
+
+import importlib
+import pathlib
+import re
+
+import pytest
+
+from milx import envs
+from milx.config import PRESETS
+from milx.methods import METHODS
+
+DOCS = pathlib.Path(__file__).parents[1] / "docs"
+
+
+def blocks(path, language):
+    return re.findall(rf"^```{language}\n(.*?)^```", path.read_text(), re.MULTILINE | re.DOTALL)
+
+
+@pytest.mark.parametrize("path", sorted(DOCS.glob("*.md")), ids=lambda path: path.stem)
+def test_the_blocks_of_a_how_to_run(path, tmp_path, monkeypatch, cache):
+    monkeypatch.chdir(tmp_path)
+    for registry in (envs.ENVS, PRESETS, METHODS):
+        for name in ("beside", "nearest"):  # what the how-tos register is gone afterwards
+            monkeypatch.setitem(registry, name, None)
+    scope = {"__name__": "__main__"}
+    code = blocks(path, "python")
+    assert code
+    for block in code:
+        exec(compile(block, path.name, "exec"), scope)
+
+
+@pytest.mark.parametrize("path", [*sorted(DOCS.glob("*.md")), DOCS.parent / "README.md"], ids=lambda path: path.stem)
+def test_links_and_commands_lead_somewhere(path):
+    text = path.read_text()
+    for link in re.findall(r"\]\(([^)#]+)\)", text):
+        assert link.startswith("http") or (path.parent / link).exists(), link
+    for module in re.findall(r"python -m (milx[\w.]*)", text):
+        assert importlib.util.find_spec(module), module
+    for script in re.findall(r"python (experiments/\S+\.py)", text):
+        assert (DOCS.parent / script).is_file(), script
