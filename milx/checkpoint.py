@@ -1,6 +1,16 @@
-"""Checkpoints through Orbax: written in the background, the latest and the best kept."""
+"""Checkpoints through Orbax: the latest and the best kept, each with checksums of its files.
 
+A checkpoint that is damaged is reported and the one before it is used. In a run that goes on it is moved aside, to
+`damaged/` beside the checkpoints, so that nothing is lost and its step can be written again.
+"""
+
+import hashlib
+import json
+import os
 import pathlib
+import sys
+import tempfile
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -9,6 +19,17 @@ import numpy as np
 import orbax.checkpoint as ocp
 from orbax.checkpoint import checkpoint_managers as policies
 
+from milx import parallel
+
+UNVALIDATED = -1e9
+"""The score of a checkpoint that nobody has validated: it is the best only where there is no other."""
+_CHECKSUMS = "checksums.json"
+_METADATA = "_CHECKPOINT_METADATA"
+
+
+def _to_stderr(message: str) -> None:
+    print(f"milx: {message}", file=sys.stderr, flush=True)
+
 
 class Checkpoints:
     """The checkpoints of a run.
@@ -16,19 +37,15 @@ class Checkpoints:
     Args:
         folder: where they lie; made if missing.
         read_only: look only, never write.
+        report: told of what is damaged or could not be written.
+
+    Raises:
+        ValueError: if there are checkpoints and all of them are damaged.
     """
 
-    def __init__(self, folder: pathlib.Path, read_only: bool = False):
-        keep = policies.AnyPreservationPolicy(
-            [policies.LatestN(2), policies.BestN(get_metric_fn=lambda metrics: metrics["success"], n=1)]
-        )
-        options = ocp.CheckpointManagerOptions(
-            preservation_policy=keep,
-            best_fn=lambda metrics: metrics["success"],
-            create=not read_only,
-            read_only=read_only,
-        )
-        self._manager = ocp.CheckpointManager(folder.absolute(), options=options)
+    def __init__(self, folder: pathlib.Path, read_only: bool = False, report: Callable[[str], None] = _to_stderr):
+        self.folder, self._read_only, self._report = folder.absolute(), read_only, report
+        self._manager = self._open(self._without_damaged())
 
     @property
     def latest(self) -> int | None:
@@ -37,21 +54,36 @@ class Checkpoints:
 
     @property
     def best(self) -> int | None:
-        """Step of the checkpoint with the highest validation success; None if there is none."""
+        """Step of the checkpoint with the highest score; None if there is none."""
         return self._manager.best_step()
 
-    def save(self, step: int, items: dict[str, Any], success: float, extra: dict[str, Any]) -> None:
-        """Writes pytrees of arrays in the background.
+    def save(self, step: int, items: dict[str, Any], score: float, extra: dict[str, Any]) -> bool:
+        """Writes pytrees of arrays; where it cannot, say on a full disk, it reports that and leaves the others alone.
 
         Args:
             step: meta-updates done.
             items: pytrees by name; each can be restored alone.
-            success: validation success, by which the best checkpoint is chosen.
+            score: of the validation, by which the best checkpoint is chosen, or UNVALIDATED.
             extra: numbers to restore beside the arrays, as JSON.
+
+        Returns:
+            Whether it is written.
         """
         saves = {name: ocp.args.StandardSave(tree) for name, tree in items.items()}
         args = ocp.args.Composite(**saves, extra=ocp.args.JsonSave(extra))
-        self._manager.save(step, args=args, metrics={"success": success})
+        try:
+            self._manager.save(step, args=args, metrics={"success": score})
+            self._manager.wait_until_finished()
+            if parallel.is_first_host():
+                _write_checksums(self.folder / str(step))
+        except Exception as error:  # from threads of several libraries, with types of their own
+            self._manager = self._open(self.folder)
+            kept = "there is none before it" if self.latest is None else f"the last good one is of step {self.latest}"
+            self._report(
+                f"checkpoint of step {step} could not be written, {kept}: {str(error).strip().splitlines()[0]}"
+            )
+            return False
+        return True
 
     def restore(self, step: int, like: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
         """Reads a checkpoint.
@@ -62,14 +94,96 @@ class Checkpoints:
 
         Returns:
             The items and the extra numbers.
+
+        Raises:
+            ValueError: if it does not hold these items.
         """
         restores = {name: ocp.args.StandardRestore(tree) for name, tree in like.items()}
-        restored = self._manager.restore(step, args=ocp.args.Composite(**restores, extra=ocp.args.JsonRestore()))
+        try:
+            restored = self._manager.restore(step, args=ocp.args.Composite(**restores, extra=ocp.args.JsonRestore()))
+        except Exception as error:  # Orbax and tensorstore have many types
+            reason = f"{type(error).__name__}: {str(error).strip().splitlines()[0]}"
+            expected = "what this version of milx writes; the result file of a run names its version"
+            raise ValueError(
+                f"{self.folder / str(step)}: cannot be restored, expected {expected} ({reason})"
+            ) from error
         # Orbax pins arrays to the device that they come to, and a program compiled for free ones would compile again.
         items = {name: jax.tree.map(lambda x: jnp.asarray(np.asarray(x)), restored[name]) for name in like}
         return items, restored["extra"]
 
     def close(self) -> None:
-        """Waits until everything is written."""
-        self._manager.wait_until_finished()
+        """Ends Orbax's threads."""
         self._manager.close()
+
+    def _open(self, folder: pathlib.Path) -> ocp.CheckpointManager:
+        keep = policies.AnyPreservationPolicy(
+            [policies.LatestN(2), policies.BestN(get_metric_fn=lambda metrics: metrics["success"], n=1)]
+        )
+        options = ocp.CheckpointManagerOptions(
+            preservation_policy=keep,
+            best_fn=lambda metrics: metrics["success"],
+            create=not self._read_only,
+            read_only=self._read_only,
+        )
+        return ocp.CheckpointManager(folder, options=options)
+
+    def _without_damaged(self) -> pathlib.Path:
+        """A folder with the good checkpoints alone: this one, from which the damaged are moved, or one with links."""
+        steps = sorted(path for path in self.folder.glob("*") if path.name.isdigit())
+        damage = {path: problem for path in steps if (problem := _damage(path))}
+        for path, problem in damage.items():
+            self._report(f"checkpoint {path} is damaged and not used: {problem}")
+        if damage and len(damage) == len(steps):
+            raise ValueError(f"checkpoints: all in {self.folder} are damaged, expected at least one that is not")
+        if self._read_only and damage:
+            view = pathlib.Path(tempfile.mkdtemp())
+            for path in set(steps) - set(damage):
+                (view / path.name).symlink_to(path)
+            return view
+        if parallel.is_first_host():
+            for path in damage:
+                _move_aside(path)
+        return self.folder
+
+
+def _damage(checkpoint: pathlib.Path) -> str | None:
+    """What is wrong with a checkpoint's files; None if nothing is, or it was written before there were checksums."""
+    path = checkpoint / _CHECKSUMS
+    if not (checkpoint / _METADATA).is_file():
+        return f"{_METADATA} is missing"
+    if not path.is_file():
+        return None
+    try:
+        expected = dict(json.loads(path.read_text()))
+    except ValueError:
+        return f"{_CHECKSUMS} is no JSON"
+    found = _checksums(checkpoint)
+    for name in sorted(expected):
+        if name not in found:
+            return f"{name} is missing"
+        if found[name] != expected[name]:
+            return f"{name} has changed"
+    return None if expected else f"{_CHECKSUMS} is empty"
+
+
+def _checksums(checkpoint: pathlib.Path) -> dict[str, str]:
+    files = sorted(path for path in checkpoint.rglob("*") if path.is_file() and path.name != _CHECKSUMS)
+    return {str(path.relative_to(checkpoint)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+def _write_checksums(checkpoint: pathlib.Path) -> None:
+    partial = checkpoint.with_name(f"{checkpoint.name}.checksums")
+    with partial.open("w") as file:
+        file.write(json.dumps(_checksums(checkpoint), indent=1))
+        file.flush()
+        os.fsync(file.fileno())
+    partial.replace(checkpoint / _CHECKSUMS)
+
+
+def _move_aside(checkpoint: pathlib.Path) -> None:
+    aside = checkpoint.parent.parent / "damaged"
+    aside.mkdir(exist_ok=True)
+    target, number = aside / checkpoint.name, 1
+    while target.exists():
+        target, number = aside / f"{checkpoint.name}.{number}", number + 1
+    checkpoint.rename(target)

@@ -41,6 +41,11 @@ def on_all_hosts(condition: bool) -> bool:
     return bool(multihost_utils.process_allgather(np.array(condition)).all())
 
 
+def on_any_host(condition: bool) -> bool:
+    """Whether the condition holds in some process; all have to ask."""
+    return not on_all_hosts(not condition)
+
+
 @functools.cache
 def mesh() -> Mesh:
     """All devices of all hosts."""
@@ -55,6 +60,11 @@ def num_devices() -> int:
 def round_up(size: int) -> int:
     """The next number of tasks that the devices can share evenly."""
     return -(-size // num_devices()) * num_devices()
+
+
+def largest(x: jax.Array) -> jax.Array:
+    """The largest of the devices' scalars; to be called inside what `split_tasks` runs."""
+    return jax.lax.pmax(x, AXIS)
 
 
 def split_tasks(function: Callable[..., Any], *, shared: int = 0, average: bool = False) -> Callable[..., Any]:

@@ -202,7 +202,8 @@ class RecordedRun(Run):
         recorded = jax.tree.map(lambda x: x[0], load(self.data, [task], [[*shown, *asked]], horizon))
         support = jax.tree.map(lambda x: x[:shots], recorded.demo)
         fill = MOST_DEMOS - len(shown) - len(asked)
-        queries = jax.tree.map(lambda x: np.pad(x[shots:], [(0, fill)] + [(0, 0)] * (x.ndim - 1)), recorded)
+        rest = lambda x: np.pad(x[shots:], [(0, fill)] + [(0, 0)] * (x.ndim - 1))  # noqa: E731
+        queries = Recorded(recorded.number, *jax.tree.map(rest, (recorded.demo, recorded.there, recorded.acts)))
         indices = tuple(self.config.recorded.goal_indices)
         return queries, jax.vmap(lambda demo: with_goals(demo, indices))(support)
 

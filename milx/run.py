@@ -22,12 +22,13 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+import rich.markup
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from milx import config as config_lib
-from milx import methods, parallel, platform, results
-from milx.checkpoint import Checkpoints
+from milx import guard, methods, parallel, platform, results
+from milx.checkpoint import UNVALIDATED, Checkpoints
 from milx.config import Config
 from milx.methods import Spec
 from milx.metrics import MetricsWriter
@@ -73,6 +74,12 @@ def initial_state(trainer: Trainer, config: Config, training: Training) -> tuple
     else:
         filters = fixed.load(config.network.fixed_filters, config.network)
     return dataclasses.replace(state, params=fixed.put(state.params, filters)), batch_key
+
+
+def _describe_skipped(values: dict[str, float], step: int) -> str:
+    task = int(values["bad_task"])
+    culprit = f"in task {task} of the training set" if task >= 0 else "in the gradient"
+    return f"{values['skipped']:.0f} updates before step {step} were skipped: something was not finite, {culprit}"
 
 
 class Run(abc.ABC):
@@ -145,9 +152,22 @@ class Run(abc.ABC):
         return []
 
     def train(self) -> None:
-        """Meta-trains to the configured number of steps, from the latest checkpoint if there is one."""
+        """Meta-trains to the configured number of steps, from the latest checkpoint if there is one.
+
+        On SIGTERM it writes a checkpoint after the scan under way, which is not validated, and ends the process.
+
+        Raises:
+            ValueError: if another process trains in this folder, its checkpoints are all damaged, the last one could
+                not be written, or all updates of a scan were skipped because they were not finite.
+            SystemExit: with code 0, after SIGTERM.
+        """
+        stop = guard.Stop()
+        with guard.one_trainer(self.folder), stop.listen():
+            self._train(stop)
+
+    def _train(self, stop: guard.Stop) -> None:
         config = self.config.train
-        checkpoints = Checkpoints(self._checkpoints)
+        checkpoints = Checkpoints(self._checkpoints, report=self._warn)
         if (checkpoints.latest or 0) >= config.steps:
             return checkpoints.close()
         if self.config.network.fixed_filters not in (None, fixed.KMEANS):
@@ -157,8 +177,8 @@ class Run(abc.ABC):
         state, key = self._start(training, checkpoints)
         with self._clock("compile"):
             run_steps = compiled.result()
-        metrics = MetricsWriter(self.folder, int(state.step))
-        with self._progress(config.steps) as progress:
+        metrics, written = MetricsWriter(self.folder, int(state.step)), False
+        with stop.deferred(), self._progress(config.steps) as progress:
             bar = progress.add_task(
                 "meta-train", total=config.steps, completed=int(state.step), loss=float("nan"), rate=0
             )
@@ -171,16 +191,36 @@ class Run(abc.ABC):
                 step += config.log_every
                 metrics.write(step, {**values, "steps_per_s": rate})
                 progress.update(bar, completed=step, loss=values["loss"], rate=rate)
-                if step % config.eval_every == 0 or step >= config.steps:
-                    with self._clock("evaluate"):
-                        score = self._validate(state.params)
-                    metrics.write(step, {f"validation_{self.metric}": score})
-                    progress.console.print(f"step {step}: validation {self.metric} {score:.1%}")
+                if values["skipped"]:
+                    self._warn(_describe_skipped(values, step))
+                if values["skipped"] == config.log_every:
+                    last = f"the last good checkpoint is of step {checkpoints.latest}"
+                    raise ValueError(f"train: no update of the last {config.log_every} was finite; {last}")
+                stopping = parallel.on_any_host(stop.asked)
+                if step % config.eval_every == 0 or step >= config.steps or stopping:
+                    score = UNVALIDATED
+                    if not stopping:
+                        with self._clock("evaluate"):
+                            score = self._validate(state.params)
+                        metrics.write(step, {f"validation_{self.metric}": score})
+                        progress.console.print(f"step {step}: validation {self.metric} {score:.1%}")
                     items = {"params": state.params, "trainer": (state.step, state.optimizer)}
                     extra = {"seconds": self._elapsed(), "dataset_hash": training.dataset_hash}
-                    checkpoints.save(step, items, score, extra)
+                    written = checkpoints.save(step, items, score, extra)
+                if stopping:
+                    break
         metrics.close()
+        latest = checkpoints.latest
         checkpoints.close()
+        if not written:
+            going_on = "started again, the run goes on from there"
+            raise ValueError(f"checkpoints: the last one that could be written is of step {latest}; {going_on}")
+        if stopping and step < config.steps:
+            print(f"milx: stopped at step {step}; the same command goes on from there", flush=True)
+            raise SystemExit(0)
+
+    def _warn(self, message: str) -> None:
+        self.console.print(f"[yellow]milx: {rich.markup.escape(message)}[/yellow]")
 
     def evaluate(self) -> dict[str, Any]:
         """Evaluates the best checkpoint on the test tasks; writes and returns evaluation.json, and draws it.
@@ -188,7 +228,7 @@ class Run(abc.ABC):
         Raises:
             ValueError: if there is no checkpoint yet.
         """
-        checkpoints = Checkpoints(self._checkpoints, read_only=True)
+        checkpoints = Checkpoints(self._checkpoints, read_only=True, report=self._warn)
         step = checkpoints.best
         if step is None or checkpoints.latest is None:
             raise ValueError(f"workdir: {self.folder} has no checkpoint yet; train first")

@@ -52,7 +52,7 @@ def make_optimizer(config: OptimizerConfig, steps: int) -> optax.GradientTransfo
 
 
 def meta_gradient(method: Method, params: Params, batch: TaskBatch) -> tuple[Params, dict[str, jax.Array]]:
-    """The gradient of `method.loss`, and its metrics, "loss" among them.
+    """The gradient of `method.loss`, and its metrics, [N] of each task.
 
     A CPU works on a few tasks at a time, so that what they need stays in its cache.
 
@@ -63,8 +63,7 @@ def meta_gradient(method: Method, params: Params, batch: TaskBatch) -> tuple[Par
     """
 
     def gradient(batch: TaskBatch) -> tuple[Params, dict[str, jax.Array]]:
-        (loss, metrics), grad = jax.value_and_grad(method.loss, has_aux=True)(params, batch)
-        return grad, {"loss": loss, **metrics}
+        return jax.grad(method.loss, has_aux=True)(params, batch)
 
     images = [demo.image for demo in (batch.support, batch.query) if demo.image is not None]
     if jax.default_backend() != "cpu" or not images:
@@ -73,8 +72,8 @@ def meta_gradient(method: Method, params: Params, batch: TaskBatch) -> tuple[Par
     if at_once >= len(batch.query.action):
         return gradient(batch)
     one_task = lambda task: gradient(jax.tree.map(lambda x: x[None], task))  # noqa: E731
-    each = jax.lax.map(one_task, batch, batch_size=max(1, at_once))
-    return jax.tree.map(lambda x: x.mean(axis=0), each)
+    grad, metrics = jax.lax.map(one_task, batch, batch_size=max(1, at_once))
+    return jax.tree.map(lambda x: x.mean(axis=0), grad), jax.tree.map(jnp.ravel, metrics)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -100,20 +99,42 @@ class Trainer:
         return TrainState(jnp.zeros((), jnp.int32), params, self.optimizer.init(params))
 
     def update(self, state: TrainState, data: Any, key: jax.Array) -> tuple[TrainState, dict[str, jax.Array]]:
-        """One meta-update on the batch of (key, state.step)."""
+        """One meta-update on the batch of (key, state.step), unless its loss or its gradient is not finite.
+
+        Returns:
+            The next state, and the metrics' means over the tasks; "skipped" is 1 where the parameters stayed as they
+            were and the other metrics are 0, and "bad_task" the number of a task whose loss is not finite, else -1.
+        """
 
         def gradient(params: Params, data: Any, keys: jax.Array) -> tuple[Params, dict[str, jax.Array]]:
-            return meta_gradient(self.method, params, self.sample(data, keys))
+            batch = self.sample(data, keys)
+            grad, metrics = meta_gradient(self.method, params, batch)
+            task = jnp.zeros_like(metrics["loss"]) if batch.task is None else batch.task.astype(metrics["loss"].dtype)
+            bad = parallel.largest(jnp.where(jnp.isfinite(metrics["loss"]), -1, task).max())
+            return grad, {**jax.tree.map(jnp.mean, metrics), "bad_task": bad}
 
         keys = jax.random.split(jax.random.fold_in(key, state.step), self.train.meta_batch)
         grad, metrics = parallel.split_tasks(gradient, shared=2, average=True)(state.params, data, keys)
+        metrics["grad_norm"] = optax.tree.norm(grad)
+        good = jnp.isfinite(metrics["grad_norm"]) & jnp.isfinite(metrics["loss"])
         updates, optimizer = self.optimizer.update(grad, state.optimizer, state.params)
-        params = optax.apply_updates(state.params, updates)
-        metrics["grad_norm"] = optax.global_norm(grad)
+        updated = optax.apply_updates(state.params, updates), optimizer
+        keep = lambda new, old: jnp.where(good, new, old)  # noqa: E731
+        params, optimizer = jax.tree.map(keep, updated, (state.params, state.optimizer))
+        bad_task = metrics.pop("bad_task")
+        metrics = {name: jnp.where(good, value, 0) for name, value in metrics.items()}
+        metrics |= {"skipped": 1 - good.astype(jnp.float32), "bad_task": bad_task}
         return TrainState(state.step + 1, params, optimizer), metrics
 
     @functools.partial(jax.jit, static_argnums=(0, 4))
     def run(self, state: TrainState, data: Any, key: jax.Array, steps: int) -> tuple[TrainState, dict[str, jax.Array]]:
-        """Runs `steps` meta-updates in one scan; returns the state and the metrics' means."""
+        """Runs `steps` meta-updates in one scan.
+
+        Returns:
+            The state, and the metrics' means over the updates that were not skipped; "skipped" is how many were, and
+            "bad_task" the largest.
+        """
         state, metrics = jax.lax.scan(lambda s, _: self.update(s, data, key), state, length=steps)
-        return state, jax.tree.map(jnp.mean, metrics)
+        skipped, bad_task = metrics.pop("skipped").sum(), metrics.pop("bad_task").max()
+        means = {name: value.sum() / jnp.maximum(steps - skipped, 1) for name, value in metrics.items()}
+        return state, {**means, "skipped": skipped, "bad_task": bad_task}

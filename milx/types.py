@@ -61,7 +61,9 @@ class TaskBatch:
     Attributes:
         support: demonstrations with axes [N, K, T, ...].
         query: other demonstrations of the same tasks, with axes [N, Q, T, ...].
+        task: [N] int32, their numbers in the training set; None if they are from nowhere.
     """
 
     support: Demo
     query: Demo
+    task: Array = None

@@ -159,7 +159,9 @@ def sample_batch(
         support = [load(chosen[k], jax.random.fold_in(support_key, k), support_frames) for k in range(shots)]
         query = load(chosen[shots], query_key, query_frames)
         return TaskBatch(
-            support=jax.tree.map(lambda *xs: jnp.stack(xs), *support), query=jax.tree.map(lambda x: x[None], query)
+            support=jax.tree.map(lambda *xs: jnp.stack(xs), *support),
+            query=jax.tree.map(lambda x: x[None], query),
+            task=n,
         )
 
     return jax.vmap(sample_task)(keys)

@@ -24,11 +24,13 @@ class Recorded:
     """D demonstrations of each of N tasks, resampled to T time steps. Where a task has fewer, zeros fill the rest.
 
     Attributes:
+        number: [N] int32, the tasks' numbers in the data set.
         demo: with leading axes [N, D, T]; actions are 0 where a demonstration shows none.
         there: [N, D] bool, whether it is a demonstration.
         acts: [N, D] bool, whether it is one that shows actions.
     """
 
+    number: Array
     demo: Demo
     there: Array
     acts: Array
@@ -40,7 +42,7 @@ def shape_of(data: DataSet, num_tasks: int, num_demos: int, horizon: int) -> Rec
     image = None if head.image_shape is None else jax.ShapeDtypeStruct((*lead, *head.image_shape, 3), np.uint8)
     state, action = (jax.ShapeDtypeStruct((*lead, size), np.float32) for size in (head.state_size, head.action_size))
     which = jax.ShapeDtypeStruct(lead[:2], np.bool_)
-    return Recorded(Demo(image, state, action), which, which)
+    return Recorded(jax.ShapeDtypeStruct((num_tasks,), np.int32), Demo(image, state, action), which, which)
 
 
 def load(data: DataSet, tasks: Sequence[int], demos: Sequence[Sequence[int]], horizon: int) -> Recorded:
@@ -54,6 +56,7 @@ def load(data: DataSet, tasks: Sequence[int], demos: Sequence[Sequence[int]], ho
     """
     like = shape_of(data, len(tasks), max(len(chosen) for chosen in demos), horizon)
     whole = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), like)
+    whole.number[:] = tasks
     pending = []
     for n, (task, chosen) in enumerate(zip(tasks, demos, strict=True)):
         for d, number in enumerate(chosen):
@@ -108,7 +111,9 @@ def sample_batch(
         shown = [show(chosen[k], frame_keys[k], support_frames) for k in range(shots)]
         asked = show(query, frame_keys[shots], query_frames)
         return TaskBatch(
-            support=jax.tree.map(lambda *xs: jnp.stack(xs), *shown), query=jax.tree.map(lambda x: x[None], asked)
+            support=jax.tree.map(lambda *xs: jnp.stack(xs), *shown),
+            query=jax.tree.map(lambda x: x[None], asked),
+            task=recorded.number[n],
         )
 
     return jax.vmap(sample_task)(keys)
@@ -167,7 +172,8 @@ class Shards:
         tasks, demos = self.chosen(scan)
         loaded = load(self.data, tasks, demos, self.horizon)
         fill = self.num_demos - loaded.there.shape[1]  # as large as every shard
-        return jax.device_put(jax.tree.map(lambda x: np.pad(x, [(0, 0), (0, fill)] + [(0, 0)] * (x.ndim - 2)), loaded))
+        pad = lambda x: np.pad(x, [(0, 0), (0, fill)] + [(0, 0)] * (x.ndim - 2)) if x.ndim > 1 else x  # noqa: E731
+        return jax.device_put(jax.tree.map(pad, loaded))
 
     def chosen(self, scan: int) -> tuple[list[int], list[list[int]]]:
         """The numbers of a shard's tasks, and of the demonstrations of each."""

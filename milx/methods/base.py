@@ -20,7 +20,7 @@ class Method(abc.ABC):
 
     @abc.abstractmethod
     def loss(self, params: Params, batch: TaskBatch) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """The meta-objective of a batch of tasks: a scalar, and scalars worth a curve."""
+        """The meta-objective of a batch of N tasks, a scalar; and values worth a curve, [N] each, "loss" among them."""
 
     @abc.abstractmethod
     def adapt(self, params: Params, demo: Demo) -> Params:

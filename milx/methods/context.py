@@ -50,7 +50,7 @@ class ContextPolicy(Method):
         return {"actor": params["actor"], "whitening": params["whitening"], "context": context}
 
     def loss(self, params: Params, batch: TaskBatch) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """Imitation of the queries, averaged over the tasks and the support demonstrations."""
+        """Imitation of the queries, averaged over the tasks and the support demonstrations; and its parts, [N]."""
 
         def task_loss(support: Demo, query: Demo) -> tuple[jax.Array, dict[str, jax.Array]]:
             task_params = self.adapt(params, support)
@@ -64,7 +64,7 @@ class ContextPolicy(Method):
             return jax.tree.map(jnp.mean, jax.vmap(one)(task_params["context"]))
 
         loss, metrics = jax.vmap(task_loss)(batch.support, batch.query)
-        return loss.mean(), jax.tree.map(jnp.mean, metrics)
+        return loss.mean(), {"loss": loss, **metrics}
 
     def act(self, task_params: Params, observation: Observation, memory: Memory) -> tuple[jax.Array, Memory]:
         """The mean over the contexts of the actor's action."""

@@ -100,14 +100,14 @@ class MIL(Method):
         return {"policy": params["policy"], "whitening": params["whitening"]}
 
     def loss(self, params: Params, batch: TaskBatch) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """The meta-objective (eq. 3), averaged over the tasks."""
+        """The meta-objective (eq. 3), averaged over the tasks; and its parts, [N] of each task."""
 
         def task_loss(support: Demo, query: Demo) -> tuple[jax.Array, dict[str, jax.Array]]:
             adapted = self.adapt(params, support)
             return self.imitation_loss(adapted["policy"], adapted["whitening"], query)
 
         loss, metrics = jax.vmap(task_loss)(batch.support, batch.query)
-        return loss.mean(), jax.tree.map(jnp.mean, metrics)
+        return loss.mean(), {"loss": loss, **metrics}
 
     def act(self, task_params: Params, observation: Observation, memory: Memory) -> tuple[jax.Array, Memory]:
         """The adapted network's action for one observation."""

@@ -26,7 +26,7 @@ class Random(Method):
 
     def loss(self, params: Params, batch: TaskBatch) -> tuple[jax.Array, dict[str, jax.Array]]:
         """Zero: nothing to learn."""
-        return jnp.zeros(()), {}
+        return jnp.zeros(()), {"loss": jnp.zeros(len(batch.query.action))}
 
     def adapt(self, params: Params, demo: Demo) -> Params:
         """Ignores the demonstration."""
