@@ -10,6 +10,8 @@ import typing
 from collections.abc import Callable
 from typing import Any
 
+from milx import validate
+
 GIVEN = ("video+state+action", "video+state", "video")
 """What a demonstration can show of a new task."""
 
@@ -436,9 +438,11 @@ def from_dict(values: dict[str, Any]) -> Config:
     """The inverse of `to_dict`, also after a trip through JSON.
 
     Raises:
-        ValueError: for a field that does not exist; the message lists those that do.
+        ValueError: for a field that does not exist (the message lists those that do), or has a value that it cannot.
     """
-    return _build(Config, values, "config")
+    config = _build(Config, values, "config")
+    validate.check(config)
+    return config
 
 
 def flatten(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -478,6 +482,8 @@ def overrides(config: Config) -> dict[str, Any]:
 
 def _build(cls: type, values: dict[str, Any], path: str) -> Any:
     types = typing.get_type_hints(cls)
+    if not isinstance(values, dict) or not all(isinstance(name, str) for name in values):
+        raise ValueError(f"{path}: got {values!r}, expected a group of fields")
     unknown = sorted(set(values) - set(types))
     if unknown:
         raise ValueError(f"{path}.{unknown[0]}: no such field, expected one of {', '.join(types)}")

@@ -27,7 +27,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from milx import config as config_lib
-from milx import guard, methods, parallel, platform, results
+from milx import guard, methods, parallel, platform, results, validate
 from milx.checkpoint import UNVALIDATED, Checkpoints
 from milx.config import Config
 from milx.methods import Spec
@@ -116,6 +116,7 @@ class Run(abc.ABC):
         self._checkpoints = self.folder / "checkpoints"
         if not parallel.is_first_host():  # its copies of the other files are the same, and not needed
             self.folder = pathlib.Path(tempfile.mkdtemp())
+        validate.check(config)
         check_steps(config)
         if config.train.meta_batch % parallel.num_devices():
             expected = f"a multiple of the {parallel.num_devices()} devices"

@@ -17,7 +17,7 @@ ALL = [(env, preset) for env, presets in PRESETS.items() for preset in presets]
 def test_json_and_back(env, preset):
     config = make_config(env, "mil", preset, seed=3)
     config.train.support_frames = None
-    config.network.filters = (5, 6, 7)
+    config.network.filters = tuple(5 + i for i in range(len(config.network.strides)))
     config.optimizer.clip_norm = 0.125
     again = config_lib.from_dict(json.loads(json.dumps(config_lib.to_dict(config))))
     assert again == config

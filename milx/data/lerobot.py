@@ -146,8 +146,16 @@ class LeRobot:
             raise ValueError(f"{path}: codebase_version: got {version}, expected v3.0; convert it with `{_CONVERTER}`")
         if not version.startswith("v3"):
             raise ValueError(f"{path}: codebase_version: got {version}, expected v3.0")
-        if not isinstance(features, dict) or not isinstance(fps, int | float) or not fps > 0:
+        if not isinstance(features, dict) or not isinstance(fps, int | float) or not 0 < fps < 10_000:
             raise ValueError(f"{path}: features or fps: not as in LeRobot's metadata")
+        for name, feature in features.items():
+            there = isinstance(feature, dict) and isinstance(feature.get("dtype"), str)
+            if not there or not isinstance(feature.get("shape"), list):
+                raise ValueError(f"{path}: features.{name}: got {feature!r:.200}, expected a dtype and a shape")
+        for field in ("data_path", "video_path"):
+            needed = field == "data_path" or any(feature["dtype"] == "video" for feature in features.values())
+            if needed and not isinstance(info.get(field), str):
+                raise ValueError(f"{path}: {field}: got {info.get(field)!r:.200}, expected a path")
         return info
 
     def _only_camera(self) -> str:

@@ -95,8 +95,7 @@ class Robomimic:
             return Demo(image, np.concatenate(states, axis=1) if states else None, action)
 
     def _only_camera(self, file: Any, demo: str) -> str:
-        _check_links(file, f"data/{demo}/obs")
-        cameras = [name for name in file.get(f"data/{demo}/obs", {}) if name.endswith("_image")]
+        cameras = [name for name in _members(file, f"data/{demo}/obs") if name.endswith("_image")]
         if len(cameras) > 1:
             raise ValueError(f"camera: expected one of {', '.join(cameras)}, or none with --camera=")
         return cameras[0] if cameras else ""
@@ -115,11 +114,11 @@ def _open(path: pathlib.Path) -> Any:
 
 def _demos(file: Any) -> list[str]:
     """The names of the demonstrations, demo_2 before demo_10."""
-    _check_links(file, "data")
-    if not len(file.get("data", {})):
+    names = _members(file, "data")
+    if not names:
         raise ValueError(f"{file.filename}: has no demonstrations under data/")
     number = lambda name: int((re.findall(r"\d+", name) or ["0"])[-1])  # noqa: E731
-    return sorted(file["data"], key=lambda name: (number(name), name))
+    return sorted(names, key=lambda name: (number(name), name))
 
 
 def _dataset(file: Any, name: str, axes: int) -> Any:
@@ -129,7 +128,7 @@ def _dataset(file: Any, name: str, axes: int) -> Any:
     _check_links(file, name)
     where, found = f"{file.filename}: {name}", file.get(name)
     if not isinstance(found, h5py.Dataset):
-        there = ", ".join(file.get(name.rpartition("/")[0], {})) or "nothing"
+        there = ", ".join(_members(file, name.rpartition("/")[0])) or "nothing"
         raise ValueError(f"{where}: missing, there is {there}")
     if found.is_virtual or found.external:
         raise ValueError(f"{where}: is stored outside the file, which is not read")
@@ -137,6 +136,15 @@ def _dataset(file: Any, name: str, axes: int) -> Any:
         raise ValueError(f"{where}: got {found.dtype} {list(found.shape)}, expected numbers with {axes} axes")
     shared.check_size(where, found.shape, found.dtype.itemsize)
     return found
+
+
+def _members(file: Any, name: str) -> list[str]:
+    """The names in a group; none if it is no group."""
+    import h5py
+
+    _check_links(file, name)
+    group = file.get(name)
+    return list(group) if isinstance(group, h5py.Group) else []
 
 
 def _check_links(file: Any, name: str) -> None:

@@ -1,0 +1,211 @@
+"""Whatever comes in: it works, or a ValueError names the field, what came and what was expected.
+
+Cases are drawn by Hypothesis; CASES says how many of each kind, 2,300 together.
+"""
+
+import dataclasses
+import json
+import pathlib
+import re
+import shutil
+
+import h5py
+import hypothesis.extra.numpy as arrays
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from milx import config as config_lib
+from milx import recording
+from milx.config import GIVEN, PRESETS, make_config
+from milx.data import lerobot
+from milx.data.dataset import DataSet, Writer
+from milx.data.lerobot import LeRobot
+from milx.data.robomimic import Robomimic
+from milx.methods import Spec
+from milx.policy import check_demo, check_observation
+from milx.types import Demo, Observation
+
+CASES = {"demos": 700, "observations": 300, "configs": 500, "headers": 400, "lerobot": 250, "robomimic": 150}
+FIXTURES = pathlib.Path(__file__).parent / "fixtures"
+SPEC = Spec((4, 5), 3, 2, ((-1.0, -2.0), (1.0, 2.0)), ())
+"""Without goals, which JAX would compile for every length."""
+
+
+def cases(name):
+    quiet = [HealthCheck.too_slow, HealthCheck.function_scoped_fixture, HealthCheck.filter_too_much]
+    return settings(max_examples=CASES[name], deadline=10_000, suppress_health_check=quiet, derandomize=True)
+
+
+def accepted(function):
+    """What it returns, or None where a ValueError says why not, in the way that all errors do."""
+    try:
+        return function()
+    except ValueError as error:
+        text = str(error)
+        assert re.search(r"^[\w./ '\[\]:()-]+: ", text) or " has no " in text or "expected" in text, text
+        assert len(text) < 2000
+        return None
+
+
+DTYPES = st.sampled_from([np.uint8, np.float32, np.float64, np.int64, np.bool_, np.complex64, "U3", "M8[s]", object])
+SHAPES = st.one_of(
+    st.sampled_from([(6, 4, 5, 3), (6, 3), (6, 2), (1, 6, 4, 5, 3), (1, 6, 3), (1, 6, 2), (6, 3, 4, 5), (1, 1, 3)]),
+    arrays.array_shapes(min_dims=0, max_dims=6, min_side=0, max_side=7),
+)
+ARRAYS = st.one_of(
+    st.none(),
+    st.text(max_size=3),
+    st.lists(st.lists(st.integers(), max_size=3), max_size=3),
+    st.builds(lambda shape, dtype: np.zeros(shape, dtype), SHAPES, DTYPES),
+    arrays.arrays(np.float32, st.sampled_from([(6, 3), (6, 2), (1, 6, 2)]), elements=st.floats(width=32)),
+    st.just(np.broadcast_to(np.uint8(1), (10**6, 4, 5, 3))),
+)
+
+
+@cases("demos")
+@given(st.builds(Demo, ARRAYS, ARRAYS, ARRAYS, st.none()), st.sampled_from(GIVEN))
+def test_demos(demo, shown):
+    checked = accepted(lambda: check_demo(demo, SPEC, shown))
+    if checked is not None:
+        length = checked.image.shape[1]
+        assert checked.image.shape == (checked.image.shape[0], length, 4, 5, 3)
+        assert checked.image.dtype == np.uint8
+        for value, size in ((checked.state, 3), (checked.action, 2)):
+            assert value is None or (value.shape[1:] == (length, size) and np.isfinite(value).all())
+        assert checked.action is None or (np.abs(checked.action) <= [1, 2]).all()
+
+
+@cases("observations")
+@given(ARRAYS, ARRAYS)
+def test_observations(image, state):
+    checked = accepted(lambda: check_observation(Observation(image, state), SPEC))
+    if checked is not None:
+        assert checked.image.shape == (4, 5, 3)
+        assert checked.state.shape == (3,)
+
+
+JSON = st.recursive(
+    st.one_of(st.none(), st.booleans(), st.integers(-3, 10**12), st.floats(), st.text(max_size=5)),
+    lambda inner: st.one_of(st.lists(inner, max_size=4), st.dictionaries(st.text(max_size=5), inner, max_size=3)),
+    max_leaves=5,
+)
+
+
+@cases("configs")
+@given(data=st.data())
+def test_configs(data):
+    """A field of a preset with any value: what is accepted comes back, and is a number where it must be one."""
+    env = data.draw(st.sampled_from(sorted(PRESETS)))
+    values = config_lib.to_dict(make_config(env, preset="cpu"))
+    name = data.draw(st.sampled_from([*config_lib.flatten(values), "train", "nope"]))
+    *path, last = name.split(".")
+    group = values
+    for part in path:
+        group = group[part]
+    group[last] = data.draw(st.one_of(JSON, st.just([3, 3]), st.just([0]), st.integers(1, 5)))
+    config = accepted(lambda: config_lib.from_dict(values))
+    if config is not None:
+        assert config_lib.from_dict(json.loads(json.dumps(config_lib.to_dict(config)))) == config
+        for field, value in config_lib.flatten(config_lib.to_dict(config)).items():
+            if isinstance(value, float):
+                assert np.isfinite(value), field
+
+
+@pytest.fixture(scope="module")
+def data_set(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("bad") / "set"
+    with Writer(folder, (4, 5), 3, 2) as writer:
+        for i, split in enumerate(("train", "validation", "test")):
+            demos = [Demo(np.zeros((6, 4, 5, 3), np.uint8), np.ones((6, 3)), np.ones((6, 2))) for _ in range(2)]
+            writer.add(f"task {i}", split, [6, 6], demos)
+    return folder
+
+
+def mutate(data, values):
+    """Puts any value, or nothing, at a random place of nested dictionaries and lists."""
+    place, key = None, None
+    here = values
+    while isinstance(here, dict | list) and here and (place is None or data.draw(st.integers(0, 3))):
+        key = data.draw(st.sampled_from(sorted(here) if isinstance(here, dict) else range(len(here))))
+        place, here = here, here[key]
+    if data.draw(st.booleans()):
+        place[key] = data.draw(JSON)
+    else:
+        del place[key]
+
+
+@cases("headers")
+@given(data=st.data())
+def test_headers_of_data_sets(data_set, data):
+    values = json.loads((data_set / "zarr.json").read_text())
+    mutate(data, values["attributes"])
+    folder = data_set.parent / "mutated"
+    folder.mkdir(exist_ok=True)
+    for task in data_set.glob("0*"):
+        if not (folder / task.name).exists():
+            (folder / task.name).symlink_to(task)
+    (folder / "zarr.json").write_text(json.dumps(values))
+
+    def read():
+        opened = DataSet(folder)
+        recording.make_config(folder, preset="cpu")
+        return [opened.read(i, j) for i, task in enumerate(opened.header.tasks) for j in range(len(task.lengths))]
+
+    demos = accepted(read)
+    if demos is not None:
+        for demo in demos:
+            for value in dataclasses.astuple(demo):
+                assert value is None or (value.size <= 12 * 60 and np.unique(value).size <= 1)
+
+
+@cases("lerobot")
+@given(data=st.data())
+def test_metadata_of_lerobot(data, tmp_path_factory):
+    root = pathlib.Path(shutil.copytree(FIXTURES / "lerobot", tmp_path_factory.mktemp("bad") / "set"))
+    path = root / "meta" / "info.json"
+    values = json.loads(path.read_text())
+    for unused in ("total_tasks", "splits", "robot_type", "chunks_size"):
+        values.pop(unused)
+    mutate(data, values)
+    path.write_text(json.dumps(values))
+    lerobot._read_table.cache_clear()
+    camera = data.draw(st.sampled_from([None, "", "observation.images.top", "observation.images.wrist"]))
+
+    def read():
+        source = LeRobot(root, camera, "observation.state", "action", 128)
+        return [episode.read() for episode in source.episodes("task_index")[:2]]
+
+    demos = accepted(read)
+    if demos is not None:
+        assert [len(demo.state) for demo in demos] == [12, 9]
+    shutil.rmtree(root)
+
+
+@cases("robomimic")
+@given(data=st.data())
+def test_files_of_robomimic(data, tmp_path_factory):
+    path = pathlib.Path(shutil.copy(FIXTURES / "robomimic" / "stack.hdf5", tmp_path_factory.mktemp("bad") / "set.hdf5"))
+    names = ("actions", "obs/agentview_image", "obs/robot0_eef_pos", "obs")
+    name = f"data/demo_0/{data.draw(st.sampled_from(names))}"
+    shape = data.draw(arrays.array_shapes(min_dims=0, max_dims=4, min_side=0, max_side=6))
+    dtype = data.draw(
+        st.sampled_from([np.uint8, np.float32, np.int64, np.bool_, np.complex64, "S3", h5py.string_dtype()])
+    )
+    with h5py.File(path, "a") as file:
+        del file[name]
+        if data.draw(st.booleans()):
+            file.create_dataset(name, shape, dtype)
+
+    def read():
+        source = Robomimic(path, None, "robot0_eef_pos", "actions", 128)
+        return source.sizes, [episode.read() for episode in source.episodes("file")]
+
+    found = accepted(read)
+    if found is not None:
+        sizes, demos = found
+        assert len(demos) == 2
+        for demo in demos:
+            assert sizes.image_shape is None or demo.image.shape[1:] == (*sizes.image_shape, 3)
+    path.unlink()
