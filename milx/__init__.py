@@ -3,6 +3,7 @@
 from milx import platform as _platform
 
 _platform.configure()
+_platform.import_mjx()
 
 from milx.envs import ENVS, make  # noqa: E402
 from milx.methods import METHODS  # noqa: E402

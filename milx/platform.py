@@ -1,5 +1,7 @@
 """Set-up of the JAX platform: done once, when milx is imported and before JAX starts its backend."""
 
+import contextlib
+import io
 import os
 import pathlib
 
@@ -35,6 +37,12 @@ def pixel_options(chain: int = 0) -> dict[str, str | bool]:
     """
     fuse = _OLD_JAXLIB and jax.default_backend() == "cpu" and chain <= _SHORT_CHAIN
     return {"xla_cpu_use_fusion_emitters": True} if fuse else {}
+
+
+def import_mjx() -> None:
+    """Imports MJX, which else prints a line for each optional package of its that is not installed."""
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+        import mujoco.mjx  # noqa: F401
 
 
 def configure() -> None:

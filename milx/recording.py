@@ -64,6 +64,10 @@ def read_vectors(data: DataSet, tasks: list[int], horizon: int) -> Statistics:
         info = data.header.tasks[task]
         for number, length in enumerate(info.lengths):
             demo = data.read(task, number, spread(length, horizon), fields=("state", "action"))
+            for field, value in (("state", demo.state), ("action", demo.action)):
+                if value is not None and not np.isfinite(value).all():
+                    where = f"demonstration {number} of task {task} ({info.name!r})"
+                    raise ValueError(f"data: {field} of {where}: got values that are not finite, expected finite ones")
             states.append(np.zeros((horizon, 0), np.float32) if demo.state is None else demo.state)
             if demo.action is not None:
                 actions.append(demo.action)

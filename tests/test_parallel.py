@@ -91,13 +91,27 @@ def run(folder):
 
     run = SimulatedRun(tiny_config(env="reach_state"), folder, QUIET)
     run.train()
-    return {"metrics": [json.loads(line) for line in (run.folder / "metrics.jsonl").open()]}
+    return {
+        "metrics": [json.loads(line) for line in (run.folder / "metrics.jsonl").open()],
+        "params": params_of(folder),
+    }
+
+
+def params_of(folder):
+    """The parameters of a run, as one list of numbers; restored on all devices that there are."""
+    import jax
+
+    import milx
+
+    leaves = jax.tree.leaves(milx.load(folder).params)
+    return [float(x) for leaf in leaves for x in np.ravel(leaf)]
 
 
 def work(arguments):
-    """Runs in a process of its own: `devices 1,4`, `alone FOLDER`, or `host ID ADDRESS FOLDER`."""
+    """Runs in a process of its own: `devices 1,4 FOLDER`, `alone FOLDER`, or `host ID ADDRESS FOLDER`."""
     if arguments[0] == "devices":
-        return {n: measure(int(n), everything=True) for n in arguments[1].split(",")}
+        found = {n: measure(int(n), everything=True) for n in arguments[1].split(",")}
+        return found | {"restored": params_of(arguments[2])}
     if arguments[0] == "alone":
         return run(arguments[1])
     from milx import parallel
@@ -127,8 +141,8 @@ def answer(process):
 
 
 @pytest.fixture(scope="module")
-def devices(cache):
-    return answer(start(4, "devices", "1,4"))
+def devices(alone):
+    return answer(start(4, "devices", "1,4", alone["folder"]))
 
 
 @pytest.fixture(scope="module")
@@ -145,7 +159,8 @@ def hosts(cache, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def alone(cache, tmp_path_factory):
-    return answer(start(1, "alone", tmp_path_factory.mktemp("alone") / "run"))
+    folder = tmp_path_factory.mktemp("alone") / "run"
+    return answer(start(1, "alone", folder)) | {"folder": folder}
 
 
 def test_losses_of_fifty_updates_do_not_depend_on_the_number_of_devices(devices):
@@ -159,6 +174,11 @@ def test_demonstrations_and_trials_do_not_depend_on_the_number_of_devices(device
     for name in ("trials", "action"):
         np.testing.assert_allclose(devices["4"][name], devices["1"][name], rtol=1e-5, atol=1e-4)
         assert np.std(devices["1"][name]) > 1e-3
+
+
+def test_a_checkpoint_of_one_device_is_restored_on_four(alone, devices):
+    assert len(set(alone["params"])) > 1000
+    assert devices["restored"] == alone["params"]
 
 
 def test_two_hosts_have_the_losses_of_one_device(devices, hosts):

@@ -3,8 +3,11 @@
 import dataclasses
 import io
 import json
+import os
+import signal
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from rich.console import Console
@@ -12,7 +15,10 @@ from tiny import QUIET
 
 import milx
 from milx import recording, runs
+from milx.checkpoint import Checkpoints
 from milx.data.dataset import DataSet, Writer
+from milx.methods.maml import MIL
+from milx.metrics import MetricsWriter
 from milx.recording import RecordedRun
 from milx.types import Demo
 
@@ -108,7 +114,7 @@ def test_whitening_is_fitted_to_the_training_tasks_alone(trained, folder):
         np.testing.assert_allclose(getattr(whitening, f"{field}_scale"), values.std(axis=0), rtol=1e-4)
 
 
-def test_an_interrupted_run_ends_bit_for_bit_like_the_uninterrupted_one(trained, folder, tmp_path, monkeypatch):
+def test_an_interrupted_run_ends_bit_for_bit_like_the_uninterrupted_one(trained, folder, tmp_path, monkeypatch, capsys):
     """Also when the data passes by in shards, of which none is whole."""
     config = tiny_config(folder)
     config.train.steps, config.train.eval_every = 200, 100
@@ -134,8 +140,22 @@ def test_an_interrupted_run_ends_bit_for_bit_like_the_uninterrupted_one(trained,
         patch.setattr(RecordedRun, "_validate", stop)
         with pytest.raises(KeyboardInterrupt):
             final(tmp_path / "stopped")
-    stopped, straight = final(tmp_path / "stopped"), final(tmp_path / "straight")
-    jax.tree.map(np.testing.assert_array_equal, stopped, straight)
+    with monkeypatch.context() as patch:
+        write = MetricsWriter.write
+
+        def terminate(self, step, values):
+            os.kill(os.getpid(), signal.SIGTERM)
+            write(self, step, values)
+
+        patch.setattr(MetricsWriter, "write", terminate)
+        with pytest.raises(SystemExit) as ended:
+            final(tmp_path / "terminated")
+    assert ended.value.code == 0
+    assert "milx: stopped at step 100; the same command goes on from there" in capsys.readouterr().out
+    straight = final(tmp_path / "straight")
+    for name in ("stopped", "terminated"):
+        assert Checkpoints(tmp_path / name / "checkpoints", read_only=True).latest == 100
+        jax.tree.map(np.testing.assert_array_equal, final(tmp_path / name), straight)
 
 
 def test_bad_data_is_refused_before_anything_is_compiled(folder, tmp_path):
@@ -152,6 +172,61 @@ def test_bad_data_is_refused_before_anything_is_compiled(folder, tmp_path):
     config.train.shots = 3
     with pytest.raises(ValueError, match=r"expected at least one with more than train.shots = 3 demonstrations"):
         RecordedRun(config, tmp_path / "run", QUIET)
+
+
+def run_with_losses(folder, workdir, monkeypatch, spoil):
+    """A run in which the loss of every task is multiplied by `spoil(number of the task)`; returns what it said, too."""
+    config = tiny_config(folder)
+    config.train.steps = config.train.eval_every = 60
+    config.train.log_every, config.train.meta_batch = 20, 2
+    original = MIL.loss
+
+    def loss(self, params, batch):
+        _, metrics = original(self, params, batch)
+        each = metrics["loss"] * spoil(batch.task)
+        return each.mean(), {**metrics, "loss": each}
+
+    monkeypatch.setattr(MIL, "loss", loss)
+    console = Console(record=True, width=200, file=io.StringIO())
+    return RecordedRun(config, workdir, console), console
+
+
+def test_updates_that_are_not_finite_are_skipped_counted_and_named(folder, tmp_path, monkeypatch):
+    """One training task of thirty is to blame: about one batch of two in fifteen, and no parameter sees it."""
+    run, console = run_with_losses(folder, tmp_path, monkeypatch, lambda n: jnp.where(n == 17, jnp.nan, 1.0))
+    run.train()
+    lines = [json.loads(line) for line in (tmp_path / "metrics.jsonl").open()]
+    skipped = [line["skipped"] for line in lines if "skipped" in line]
+    assert 0 < sum(skipped) < 20
+    assert {line["bad_task"] for line in lines if line.get("skipped")} == {17}
+    assert all(np.isfinite(line["loss"]) for line in lines if "loss" in line)
+    said = console.export_text()
+    assert said.count("were skipped: something was not finite, in task 17 of the training set") == np.count_nonzero(
+        skipped
+    )
+    params = milx.load(tmp_path).params
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(params))
+
+
+def test_a_run_without_a_finite_update_stops(folder, tmp_path, monkeypatch):
+    run, _ = run_with_losses(folder, tmp_path, monkeypatch, lambda n: jnp.inf * jnp.ones_like(n, jnp.float32))
+    with pytest.raises(
+        ValueError, match="no update of the last 20 was finite; the last good checkpoint is of step None"
+    ):
+        run.train()
+
+
+def test_data_that_are_not_finite_are_refused_by_name(tmp_path):
+    rng = np.random.default_rng(0)
+    demos = [random_demo(rng, np.ones(2), 8) for _ in range(3)]
+    demos[1].action[3, 0] = np.inf
+    with Writer(tmp_path / "set", (12, 16), 3, 2, "a test") as writer:
+        writer.add("lift", "train", [8, 8, 8], demos)
+    run = RecordedRun(tiny_config(tmp_path / "set"), tmp_path / "run", QUIET)
+    with pytest.raises(
+        ValueError, match=r"data: action of demonstration 1 of task 0 \('lift'\): got values that are not"
+    ):
+        run._load()
 
 
 def test_the_report_names_the_floors(trained):

@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 import pathlib
+import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -72,12 +73,23 @@ def collect(env: Env, key: jax.Array, split: str, num_tasks: int, num_demos: int
         lambda *chunk: perform(env, *chunk, options, config.noise), tuple(inputs), config.plan_batch
     )
     success, _ = map_in_chunks(functools.partial(judge, env), (inputs[0], states), config.plan_batch)
+    states, action, success = _without_diverged(states, action, success)
     states, action, success = jax.tree.map(
         lambda x: x.reshape(num_tasks, num_demos, *x.shape[1:]), (states, action, success)
     )
     order = jnp.argsort(~success, axis=1)
     rows = jnp.arange(num_tasks)[:, None]
     return DemoSet(tasks, *jax.tree.map(lambda x: x[rows, order], (states, action, success)))
+
+
+def _without_diverged(states: State, action: jax.Array, success: jax.Array) -> tuple[State, jax.Array, jax.Array]:
+    """Zeros, which count as failed, in place of what is not finite of M demonstrations; says how many there are."""
+    flat = [x.reshape(len(x), -1) for x in jax.tree.leaves((states, action)) if x.size]
+    finite = jnp.stack([jnp.isfinite(x).all(axis=1) for x in flat]).all(axis=0)
+    if diverged := int((~finite).sum()):
+        print(f"milx: {diverged} of {len(finite)} demonstrations diverged and are dropped", file=sys.stderr)
+    keep = lambda x: jnp.where(finite.reshape(-1, *[1] * (x.ndim - 1)), x, jnp.zeros((), x.dtype))  # noqa: E731
+    return *jax.tree.map(keep, (states, action)), success & finite
 
 
 @functools.partial(jax.jit, static_argnums=(0, 2, 3, 4))

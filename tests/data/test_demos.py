@@ -139,6 +139,24 @@ def test_the_hash_of_a_cached_set_covers_the_sources_that_it_depends_on():
         assert path.with_suffix(".py") in hashed or path / "__init__.py" in hashed, name
 
 
+def test_demonstrations_that_diverge_are_dropped_and_counted(trained, monkeypatch, capsys):
+    """The third of eight planned ones leaves the world, the fifth has no action any more."""
+    env, config = trained.run.env, dataclasses.replace(trained.config.data, plan_batch=8)
+
+    def diverge(env, task, state, key, options, noise):
+        states = jax.tree.map(lambda x: jnp.repeat(x[:, None], env.horizon + 1, axis=1), state)
+        qpos = states.qpos.at[2, 30].set(jnp.inf)
+        return dataclasses.replace(states, qpos=qpos), jnp.ones((8, env.horizon, 2)).at[4, 7, 1].set(jnp.nan)
+
+    monkeypatch.setattr(demos_lib, "perform", diverge)
+    monkeypatch.setattr(demos_lib, "judge", lambda env, task, states: (jnp.ones(8, bool), {}))
+    demos = demos_lib.collect(env, jax.random.key(0), "train", 4, 2, config)
+    assert "2 of 8 demonstrations diverged and are dropped" in capsys.readouterr().err
+    assert demos.success.tolist() == [[True, True], [True, False], [True, False], [True, True]]
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(demos) if leaf.dtype != bool)
+    np.testing.assert_array_equal(demos.action[~demos.success], 0)
+
+
 def test_sets_of_the_splits_share_no_colour(trained):
     colors = [
         np.asarray(getattr(trained, split).task.object_color).reshape(-1, 3)

@@ -1,0 +1,72 @@
+"""One trainer for a folder, and a process that is told to stop."""
+
+import os
+import pathlib
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+
+import pytest
+
+from milx import guard
+
+HOLD = """
+import pathlib, sys, time
+from milx import guard
+with guard.one_trainer(pathlib.Path(sys.argv[1])):
+    print("held", flush=True)
+    time.sleep(60)
+"""
+
+
+def start(program, *arguments):
+    command = [sys.executable, "-c", textwrap.dedent(program), *map(str, arguments)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+
+
+def test_a_second_trainer_is_refused_while_the_first_lives_and_admitted_after_it_died(tmp_path):
+    first = start(HOLD, tmp_path)
+    assert first.stdout.readline() == "held\n"
+    held = rf"workdir: .* is in use by process {first.pid} on .*, expected no other"
+    with pytest.raises(ValueError, match=held), guard.one_trainer(tmp_path):
+        pass
+    first.kill()
+    first.wait()
+    with guard.one_trainer(tmp_path):
+        assert f"process {os.getpid()} " in (tmp_path / "lock").read_text()
+        with pytest.raises(ValueError, match=rf"in use by process {os.getpid()} "), guard.one_trainer(tmp_path):
+            pass
+    with guard.one_trainer(pathlib.Path(tmp_path)):
+        pass
+
+
+def test_the_signal_is_noted_where_it_is_deferred_and_what_was_there_before_comes_back():
+    before, stop = signal.getsignal(signal.SIGTERM), guard.Stop()
+    with stop.listen(), stop.deferred():
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(0.01)
+        assert stop.asked
+    assert signal.getsignal(signal.SIGTERM) == before
+
+
+def test_elsewhere_the_signal_ends_the_process_at_once_and_well():
+    """Even while a thread is at work that would go on for a minute."""
+    program = """
+    import threading, time
+    from milx import guard
+    stop = guard.Stop()
+    with stop.listen():
+        threading.Thread(target=time.sleep, args=(60,)).start()
+        print("ready", flush=True)
+        time.sleep(60)
+    """
+    process = start(program)
+    assert process.stdout.readline() == "ready\n"
+    began = time.monotonic()
+    process.terminate()
+    out, _ = process.communicate()
+    assert time.monotonic() - began < 10
+    assert process.returncode == 0
+    assert "the same command starts again" in out
