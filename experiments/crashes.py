@@ -69,9 +69,15 @@ def finish(data: pathlib.Path, workdir: pathlib.Path) -> str:
     return digest.hexdigest()
 
 
-def writing(workdir: pathlib.Path) -> bool:
-    """Whether a checkpoint is being written."""
-    return any("tmp" in path.name or "checksums" in path.name for path in (workdir / "checkpoints").glob("*"))
+def writing(workdir: pathlib.Path, before: set[str]) -> bool:
+    """Whether a checkpoint is being written; `before` is what earlier kills left of theirs."""
+    return bool(unfinished(workdir) - before)
+
+
+def unfinished(workdir: pathlib.Path) -> set[str]:
+    """The names of checkpoints that are not complete."""
+    names = {path.name for path in (workdir / "checkpoints").glob("*")}
+    return {name for name in names if "tmp" in name or "checksums" in name}
 
 
 def last_step(workdir: pathlib.Path) -> int:
@@ -82,13 +88,14 @@ def last_step(workdir: pathlib.Path) -> int:
 
 def kill(data: pathlib.Path, workdir: pathlib.Path, rng: random.Random, in_write: bool, longest: float) -> dict:
     """Starts the run and kills it: at a random moment, or once a checkpoint is being written."""
-    process, began, before = start(data, workdir), time.monotonic(), last_step(workdir)
+    left, before = unfinished(workdir), last_step(workdir)
+    process, began = start(data, workdir), time.monotonic()
     deadline = began + rng.uniform(0, longest)
     while process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.001)
-    while in_write and process.poll() is None and not writing(workdir):
+    while in_write and process.poll() is None and not writing(workdir, left):
         time.sleep(0.0002)
-    during = writing(workdir)
+    during = writing(workdir, left)
     alive = process.poll() is None
     process.kill()
     process.communicate()
