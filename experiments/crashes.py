@@ -8,6 +8,7 @@ code 0 and a word on how to go on.
 """
 
 import hashlib
+import json
 import pathlib
 import random
 import signal
@@ -19,10 +20,13 @@ import time
 import jax
 import numpy as np
 from absl import app, flags, logging
+from rich.console import Console
 
+from milx import config as config_lib
 from milx import policy, provenance, results
 from milx.checkpoint import Checkpoints
 from milx.data.dataset import Writer
+from milx.recording import RecordedRun
 from milx.types import Demo
 
 _KILLS = flags.DEFINE_integer("kills", 30, "SIGKILLs.", lower_bound=0)
@@ -55,15 +59,18 @@ def start(data: pathlib.Path, workdir: pathlib.Path) -> subprocess.Popen:
 
 
 def finish(data: pathlib.Path, workdir: pathlib.Path) -> str:
-    """Runs to the end; returns a hash of the last checkpoint's parameters and optimizer."""
+    """Runs to the end; a hash of the last checkpoint's parameters and optimizer, and of which one is the best."""
     process = start(data, workdir)
     out, _ = process.communicate()
     if process.returncode:
         raise RuntimeError(out[-2000:])
-    loaded = policy.load(workdir)
+    config = config_lib.from_dict(json.loads((workdir / "config.json").read_text()))
+    run = RecordedRun(config, workdir, Console(quiet=True))
     checkpoints = Checkpoints(workdir / "checkpoints", read_only=True)
-    items, _ = checkpoints.restore(STEPS, {"params": loaded.params})
-    digest = hashlib.sha256()
+    params = policy.load(workdir).params
+    trainer = jax.ShapeDtypeStruct((), np.int32), jax.eval_shape(run.trainer.optimizer.init, params)
+    items, _ = checkpoints.restore(STEPS, {"params": params, "trainer": trainer})
+    digest = hashlib.sha256(str(checkpoints.best).encode())
     for leaf in jax.tree.leaves(items):
         digest.update(np.ascontiguousarray(leaf).tobytes())
     return digest.hexdigest()
@@ -111,7 +118,7 @@ def kill(data: pathlib.Path, workdir: pathlib.Path, rng: random.Random, in_write
 def terminate(data: pathlib.Path, workdir: pathlib.Path, rng: random.Random, longest: float) -> dict:
     """Starts the run, sends SIGTERM at a random moment, and looks at how it ends."""
     process = start(data, workdir)
-    time.sleep(rng.uniform(3, longest))
+    time.sleep(rng.uniform(4, longest))  # after the imports, where nothing listens yet
     alive, began = process.poll() is None, time.monotonic()
     process.send_signal(signal.SIGTERM)
     out, _ = process.communicate()
@@ -147,6 +154,8 @@ def main(_: list[str]) -> None:
             found = terminate(folder / "data", workdir, rng, 0.7 * longest)
             if found["sent"]:
                 found["same"] = finish(folder / "data", workdir) == expected
+                if found["seconds"] > 10 or found["code"] or not found["said_how"] or not found["same"]:
+                    raise RuntimeError(f"SIGTERM: {found}")
                 terms.append(found)
                 print(found, flush=True)
     same = {"rounds": rounds, "kills": len(kills), "while_writing": sum(found["while_writing"] for found in kills)}

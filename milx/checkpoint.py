@@ -111,6 +111,15 @@ class Checkpoints:
         items = {name: jax.tree.map(lambda x: jnp.asarray(np.asarray(x)), restored[name]) for name in like}
         return items, restored["extra"]
 
+    def replace(self, step: int, items: dict[str, Any], score: float, extra: dict[str, Any]) -> bool:
+        """Writes the checkpoint of a step again, say with the score that it lacked."""
+        self._manager.delete(step)
+        return self.save(step, items, score, extra)
+
+    def score(self, step: int) -> float:
+        """Of a checkpoint's validation, or UNVALIDATED."""
+        return self._manager.metrics(step)["success"]
+
     def close(self) -> None:
         """Ends Orbax's threads."""
         self._manager.close()
@@ -140,9 +149,12 @@ class Checkpoints:
             for path in set(steps) - set(damage):
                 (view / path.name).symlink_to(path)
             return view
-        if parallel.is_first_host():
+        if parallel.is_first_host() and not self._read_only:
             for path in damage:
                 _move_aside(path)
+            for path in set(steps) - set(damage):
+                if not (path / _CHECKSUMS).is_file():  # of an earlier version, or the process was killed just then
+                    _write_checksums(path)
         return self.folder
 
 

@@ -7,7 +7,7 @@ A file holds states, actions and tasks; `milx.data.demos.load` reads it.
 
 import pathlib
 
-from milx import envs, launch
+from milx import envs, launch, validate
 from milx.config import Config
 from milx.data import demos as demos_lib
 from milx.simulation import split_demos
@@ -15,6 +15,7 @@ from milx.simulation import split_demos
 
 def main(config: Config, workdir: str) -> None:
     """Writes train.npz, validation.npz and test.npz."""
+    validate.check(config)
     env = envs.make(config.env_name, config.env.image_shape)
     for split in envs.SPLITS:
         demos = split_demos(env, config, split)

@@ -314,7 +314,7 @@ def _push_cpu() -> Config:
     config.network.mixed_precision = False
     config.network.filters, config.network.kernel, config.network.strides = (16,) * 4, 3, (2, 2, 1, 1)
     config.train = TrainConfig(
-        steps=10_000, meta_batch=8, support_frames=4, query_frames=8, redraw=True, log_every=50, eval_every=2500
+        steps=10_000, meta_batch=8, support_frames=4, query_frames=8, redraw=True, log_every=25, eval_every=2500
     )
     config.evaluation = EvalConfig(validation_tasks=25, tasks=74, trials=6, baseline_trials=1, batch=25)
     return config

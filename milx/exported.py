@@ -51,13 +51,16 @@ class Policy:
             ValueError: for a field that is missing, not wanted, or of a wrong shape or type.
         """
         wanted = self.sizes["adapt"]
-        values = {}
+        values, lengths = {}, {}
         for name, value in self._checked(demo, wanted, lead=2).items():
             value = value.reshape(-1, *value.shape[-len(wanted[name]) + 1 :])
             shots, steps = wanted[name][:2]
             if len(value) != shots:
                 raise ValueError(f"{name}: got {len(value)} demonstrations, expected {shots}")
             values[name] = value[:, np.linspace(0, value.shape[1] - 1, steps).round().astype(int)]
+            lengths[name] = value.shape[1]
+        if len(set(lengths.values())) > 1:
+            raise ValueError(f"time steps: got {lengths}, expected the same of all fields")
         return self._adapt(self.params, values)
 
     def act(self, task_params, **observation):
@@ -82,5 +85,7 @@ class Policy:
                 raise ValueError(
                     f"{name}: got {value.dtype}, expected {'uint8' if name == 'image' else 'real numbers'}"
                 )
+            if not np.isfinite(value).all():
+                raise ValueError(f"{name}: got values that are not finite")
             checked[name] = value if name == "image" else value.astype(np.float32)
         return checked

@@ -8,7 +8,6 @@ import signal
 import socket
 import threading
 from collections.abc import Iterator
-from types import FrameType
 
 
 @contextlib.contextmanager
@@ -35,7 +34,8 @@ def one_trainer(folder: pathlib.Path) -> Iterator[None]:
 class Stop:
     """Whether the process was told to end (SIGTERM), as shared machines do before they take a node away.
 
-    Within `deferred` a signal is noted and `asked` becomes true; elsewhere it ends the process at once.
+    Within `deferred` a signal is noted and `asked` becomes true; elsewhere within `listen` it ends the process at once,
+    even while the main thread waits for a device.
     """
 
     def __init__(self) -> None:
@@ -48,11 +48,20 @@ class Stop:
         if threading.current_thread() is not threading.main_thread():
             yield
             return
-        before = signal.signal(signal.SIGTERM, self._on_signal)
+        ours, theirs = socket.socketpair()
+        theirs.setblocking(False)
+        # Python's own handlers wait for the main thread; what it writes to a socket, another thread reads at once.
+        before = signal.signal(signal.SIGTERM, lambda *_: None), signal.set_wakeup_fd(theirs.fileno())
+        watcher = threading.Thread(target=self._watch, args=(ours,), daemon=True)
+        watcher.start()
         try:
             yield
         finally:
-            signal.signal(signal.SIGTERM, before)
+            signal.set_wakeup_fd(before[1])
+            signal.signal(signal.SIGTERM, before[0])
+            theirs.close()
+            watcher.join()
+            ours.close()
 
     @contextlib.contextmanager
     def deferred(self) -> Iterator[None]:
@@ -63,10 +72,11 @@ class Stop:
         finally:
             self._deferred = False
 
-    def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        del number, frame
-        self.asked = True
-        if not self._deferred:
-            print("milx: stopped before the first update; the same command starts again", flush=True)
-            # Threads that compile would keep a process alive that ends in the usual way.
-            os._exit(0)
+    def _watch(self, ours: socket.socket) -> None:
+        while numbers := ours.recv(64):
+            if signal.SIGTERM in numbers:
+                self.asked = True
+                if not self._deferred:
+                    print("milx: stopped; the same command goes on", flush=True)
+                    # Threads that compile would keep a process alive that ends in the usual way.
+                    os._exit(0)

@@ -9,7 +9,7 @@ from absl import app, flags, logging
 from ml_collections import config_flags
 
 from milx import config as config_lib
-from milx import parallel, recording
+from milx import guard, parallel, recording
 from milx.config import PRESETS, Config
 from milx.envs import ENVS
 from milx.methods import METHODS
@@ -60,8 +60,9 @@ def run(main: Callable[[Config, str], None]) -> None:
         what = config.env_name if FLAGS.data is None else pathlib.Path(FLAGS.data).resolve().name
         name = f"{what}-{config.method_name}-{config.preset}-{config.seed}"
         try:
-            main(config, FLAGS.workdir or f"runs/{name}")
-        except ValueError as error:
+            with guard.Stop().listen():
+                main(config, FLAGS.workdir or f"runs/{name}")
+        except (ValueError, OSError) as error:
             sys.exit(f"milx: {error}")
 
     app.run(start, flags_parser=parse)

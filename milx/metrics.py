@@ -1,7 +1,9 @@
 """What training writes down as it goes: metrics.jsonl, and events for TensorBoard."""
 
+import contextlib
 import json
 import pathlib
+from collections.abc import Callable
 
 from tensorboardX import SummaryWriter
 
@@ -14,9 +16,11 @@ class MetricsWriter:
     Args:
         folder: the run's.
         step: where the run continues; lines after it are from before an interruption and are dropped.
+        warn: told of a line that cannot be written, say on a full disk, and is left out.
     """
 
-    def __init__(self, folder: pathlib.Path, step: int):
+    def __init__(self, folder: pathlib.Path, step: int, warn: Callable[[str], None]):
+        self._warn = warn
         path = folder / "metrics.jsonl"
         lines = [line for line in report.read_metrics(path) if line["step"] <= step] if path.is_file() else []
         partial = path.with_suffix(".partial")
@@ -27,11 +31,15 @@ class MetricsWriter:
 
     def write(self, step: int, values: dict[str, float]) -> None:
         """Writes one line."""
-        self._file.write(json.dumps({"step": step, **values}) + "\n")
+        try:
+            self._file.write(json.dumps({"step": step, **values}) + "\n")
+        except OSError as error:
+            self._warn(f"metrics of step {step} could not be written: {error}")
         for name, value in values.items():
             self._events.add_scalar(name, value, step)
 
     def close(self) -> None:
         """Flushes and closes both."""
-        self._file.close()
-        self._events.close()
+        for file in (self._file, self._events):
+            with contextlib.suppress(OSError):  # was reported when it was written
+                file.close()

@@ -15,7 +15,7 @@ import numpy as np
 from rich.console import Console
 
 from milx import config as config_lib
-from milx import report, results, whitening
+from milx import report, results, validate, whitening
 from milx.config import GIVEN, Config
 from milx.data.dataset import DataSet, spread
 from milx.data.recorded import MOST_DEMOS, Recorded, Shards, load, sample_batch, with_goals
@@ -89,6 +89,7 @@ class RecordedRun(Run):
     metric = "score"
 
     def __init__(self, config: Config, workdir: str | pathlib.Path, console: Console | None = None):
+        validate.check(config)
         self.data = DataSet(config.recorded.path)
         settings, train = config.recorded, config.train
         if settings.horizon < 1:
@@ -96,13 +97,22 @@ class RecordedRun(Run):
         if bad := [i for i in settings.goal_indices if not 0 <= i < self.data.header.state_size]:
             raise ValueError(f"recorded.goal_indices: got {bad[0]}, expected less than {self.data.header.state_size}")
         self.given_action = config.mil.given == GIVEN[0]
+        for field, shots in (("train", train.shots), ("evaluation", config.evaluation.shots)):
+            if shots >= MOST_DEMOS:
+                raise ValueError(f"{field}.shots: got {shots}, expected less than {MOST_DEMOS}")
+        for split in ("validation", "test"):
+            if not any(self._enough(i, config.evaluation.shots) for i in self.data.header.of_split(split)):
+                least = f"more than evaluation.shots = {config.evaluation.shots} demonstrations"
+                raise ValueError(
+                    f"data: {config.recorded.path} has no {split} task with {least}, expected at least one"
+                )
         tasks = [i for i in self.data.header.of_split("train") if self._enough(i, train.shots)]
         if not tasks:
             expected = (
                 f"at least one with more than train.shots = {train.shots} demonstrations, of which one shows actions"
             )
             raise ValueError(f"data: {config.recorded.path} has no such training task, expected {expected}")
-        self.shards = Shards(self.data, tasks, settings.horizon, settings.gib, config.seed)
+        self.shards = Shards(self.data, tasks, settings.horizon, settings.gib, config.seed, train.shots + 1)
 
         def sample(recorded: Recorded, keys: jax.Array) -> TaskBatch:
             frames = train.support_frames, train.query_frames
@@ -126,7 +136,8 @@ class RecordedRun(Run):
             state, action = self._vectors
             statistics = whitening.fit(jnp.asarray(state), jnp.asarray(action), self.config.mil.whiten_actions)
             dataset_hash = self.data.fingerprint()
-            self.shards.at(0)
+            held_out = [i for split in ("validation", "test") for i in self.data.header.of_split(split)]
+            read_vectors(self.data, held_out, self.config.recorded.horizon)  # refuses what is not finite
         count = sum(len(self.data.header.tasks[i].lengths) for i in self.shards.tasks)
         self.console.print(f"{count} demonstrations of {len(self.shards.tasks)} training tasks")
         at = lambda step: self.shards.at(step // self.config.train.log_every)  # noqa: E731
@@ -141,13 +152,11 @@ class RecordedRun(Run):
 
     def _validate(self, params: Params) -> float:
         errors = self._errors(params, "validation")
-        return 1 - errors["after"] / errors["mean_action"] if errors else float("nan")
+        return 1 - errors["after"] / errors["mean_action"]
 
     def _judge(self, params: Params) -> tuple[dict[str, Any], Callable[[dict[str, Any]], None]]:
         with self._clock("evaluate"):
             errors = self._errors(params, "test")
-        if not errors:
-            raise ValueError(f"data: {self.data.folder} has no test task with enough demonstrations to judge by")
         training = self.shards.tasks
         found = {
             "num_tasks_train": len(training),
@@ -175,7 +184,7 @@ class RecordedRun(Run):
         )
 
     def _errors(self, params: Params, split: str) -> dict[str, float]:
-        """Mean squared errors over the tasks of a split, in standard deviations of the actions; empty without tasks."""
+        """Mean squared errors over the tasks of a split, in standard deviations of the actions."""
         shots = self.config.evaluation.shots
         tasks = [i for i in self.data.header.of_split(split) if self._enough(i, shots)]
         action = self._vectors.action
@@ -186,8 +195,6 @@ class RecordedRun(Run):
             errors = task_errors(self.method, shots, params, recorded, support, previous, mean, scale)
             found.append({name: float(error) for name, error in errors.items()})
             previous = support
-        if not found:
-            return {}
         names = set.union(*(set(errors) for errors in found))
         means = {name: float(np.mean([errors[name] for errors in found if name in errors])) for name in sorted(names)}
         after = np.array([errors["after"] for errors in found])

@@ -1,5 +1,6 @@
 """Plots and videos of a run."""
 
+import contextlib
 import json
 import pathlib
 from typing import Any
@@ -10,8 +11,12 @@ from matplotlib.figure import Figure
 
 
 def read_metrics(path: pathlib.Path) -> list[dict[str, Any]]:
-    """The complete lines of a metrics.jsonl file; a process that was killed may have left half a line at the end."""
-    return [json.loads(line) for line in path.read_text().splitlines(keepends=True) if line.endswith("\n")]
+    """The lines of a metrics.jsonl file that are whole: a kill or a full disk may have left half a line."""
+    lines = []
+    for line in path.read_text().splitlines():
+        with contextlib.suppress(ValueError):
+            lines.append(json.loads(line))
+    return [line for line in lines if isinstance(line, dict) and "step" in line]
 
 
 def learning_curve(metrics: list[dict[str, Any]], evaluation: dict[str, Any], path: pathlib.Path) -> None:

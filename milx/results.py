@@ -1,6 +1,7 @@
 """Result files: one JSON object for a run or a cell, with the same fields in all experiments."""
 
 import json
+import os
 import pathlib
 from typing import Any
 
@@ -38,6 +39,6 @@ def describe(
 
 def write_json(path: pathlib.Path, values: dict[str, Any]) -> None:
     """Writes a file as a whole: a process that is killed leaves the old one or the new one."""
-    partial = path.with_suffix(".partial")
+    partial = path.with_suffix(f".partial{os.getpid()}")
     partial.write_text(json.dumps(values, indent=1) + "\n")
     partial.replace(path)

@@ -27,7 +27,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from milx import config as config_lib
-from milx import guard, methods, parallel, platform, results, validate
+from milx import guard, methods, parallel, platform, results
 from milx.checkpoint import UNVALIDATED, Checkpoints
 from milx.config import Config
 from milx.methods import Spec
@@ -116,7 +116,6 @@ class Run(abc.ABC):
         self._checkpoints = self.folder / "checkpoints"
         if not parallel.is_first_host():  # its copies of the other files are the same, and not needed
             self.folder = pathlib.Path(tempfile.mkdtemp())
-        validate.check(config)
         check_steps(config)
         if config.train.meta_batch % parallel.num_devices():
             expected = f"a multiple of the {parallel.num_devices()} devices"
@@ -169,7 +168,8 @@ class Run(abc.ABC):
     def _train(self, stop: guard.Stop) -> None:
         config = self.config.train
         checkpoints = Checkpoints(self._checkpoints, report=self._warn)
-        if (checkpoints.latest or 0) >= config.steps:
+        latest = checkpoints.latest
+        if latest is not None and latest >= config.steps and checkpoints.score(latest) != UNVALIDATED:
             return checkpoints.close()
         if self.config.network.fixed_filters not in (None, fixed.KMEANS):
             fixed.load(self.config.network.fixed_filters, self.config.network)  # refuses a bad file before planning
@@ -178,12 +178,28 @@ class Run(abc.ABC):
         state, key = self._start(training, checkpoints)
         with self._clock("compile"):
             run_steps = compiled.result()
-        metrics, written = MetricsWriter(self.folder, int(state.step)), False
+        metrics, written, step = MetricsWriter(self.folder, int(state.step), self._warn), True, int(state.step)
+
+        def save(state: TrainState, score: float, write: Callable[..., bool]) -> bool:
+            items = {"params": state.params, "trainer": (state.step, state.optimizer)}
+            extra = {"seconds": self._elapsed(), "dataset_hash": training.dataset_hash}
+            return write(int(state.step), items, score if np.isfinite(score) else UNVALIDATED, extra)
+
+        def validate_now(state: TrainState) -> float:
+            with self._clock("evaluate"):
+                score = self._validate(state.params)
+            metrics.write(int(state.step), {f"validation_{self.metric}": score})
+            self.console.print(f"step {int(state.step)}: validation {self.metric} {score:.1%}")
+            return score
+
+        due = step % config.eval_every == 0 or step == config.steps
+        if step and due and checkpoints.score(step) == UNVALIDATED:  # there was no time for it
+            written = save(state, validate_now(state), checkpoints.replace)
         with stop.deferred(), self._progress(config.steps) as progress:
             bar = progress.add_task(
                 "meta-train", total=config.steps, completed=int(state.step), loss=float("nan"), rate=0
             )
-            while (step := int(state.step)) < config.steps:
+            while step < config.steps and not parallel.on_any_host(stop.asked):
                 began = time.perf_counter()
                 with self._clock("train"):
                     state, values = run_steps(state, training.at(step), key)
@@ -199,24 +215,16 @@ class Run(abc.ABC):
                     raise ValueError(f"train: no update of the last {config.log_every} was finite; {last}")
                 stopping = parallel.on_any_host(stop.asked)
                 if step % config.eval_every == 0 or step >= config.steps or stopping:
-                    score = UNVALIDATED
-                    if not stopping:
-                        with self._clock("evaluate"):
-                            score = self._validate(state.params)
-                        metrics.write(step, {f"validation_{self.metric}": score})
-                        progress.console.print(f"step {step}: validation {self.metric} {score:.1%}")
-                    items = {"params": state.params, "trainer": (state.step, state.optimizer)}
-                    extra = {"seconds": self._elapsed(), "dataset_hash": training.dataset_hash}
-                    written = checkpoints.save(step, items, score, extra)
-                if stopping:
-                    break
+                    score = UNVALIDATED if stopping else validate_now(state)
+                    written = save(state, score, checkpoints.save)
+            stopping = parallel.on_any_host(stop.asked)
         metrics.close()
         latest = checkpoints.latest
         checkpoints.close()
         if not written:
             going_on = "started again, the run goes on from there"
             raise ValueError(f"checkpoints: the last one that could be written is of step {latest}; {going_on}")
-        if stopping and step < config.steps:
+        if stopping:
             print(f"milx: stopped at step {step}; the same command goes on from there", flush=True)
             raise SystemExit(0)
 

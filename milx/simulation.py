@@ -12,7 +12,7 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from milx import envs, evaluator, platform, report, whitening
+from milx import envs, evaluator, platform, report, validate, whitening
 from milx.config import Config
 from milx.data import demos as demos_lib
 from milx.data.demos import DemoSet
@@ -82,6 +82,7 @@ class SimulatedRun(Run):
     metric = "success"
 
     def __init__(self, config: Config, workdir: str | pathlib.Path, console: Console | None = None):
+        validate.check(config)
         if config.data.demos_per_task <= config.train.shots:
             expected = f"more than train.shots = {config.train.shots}: another one is the query"
             raise ValueError(f"data.demos_per_task: got {config.data.demos_per_task}, expected {expected}")

@@ -69,7 +69,7 @@ def test_every_file_of_the_newest_checkpoint_is_guarded(folder, tmp_path, damage
             continue
         DAMAGES[damage](path)
         looked = Checkpoints(mine, read_only=True, report=reports.append)
-        if not reports:  # without its checksums it is as an earlier version wrote it: whole
+        if not reports:  # without its checksums, and else unharmed, it is as an earlier version wrote it
             assert (damage, name.name) == ("missing", "checksums.json")
             assert restored(looked, looked.latest) == {"number": 1}
             continue

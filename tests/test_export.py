@@ -112,6 +112,8 @@ def test_programs_are_for_cpu_and_cuda_and_other_inputs_are_refused(tmp_path):
         ({"image": image, "state": state[:, :7], "action": action}, r"state: got shape \[70, 7\], expected \[..., 8\]"),
         ({"image": image / 255, "state": state, "action": action}, "image: got float64, expected uint8"),
         ({"image": np.stack([image] * 2), "state": state, "action": action}, "image: got 2 demonstrations, expected 1"),
+        ({"image": image[:60], "state": state, "action": action}, r"time steps: got \{.*\}, expected the same of all"),
+        ({"image": image, "state": state, "action": action * np.nan}, "action: got values that are not finite"),
         ({"image": image[:0], "state": state, "action": action}, r"image: got shape \[0, 16, 20, 3\]"),
     ):
         with pytest.raises(ValueError, match=message):

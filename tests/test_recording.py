@@ -1,10 +1,9 @@
 """A run on recorded demonstrations, from importing to a policy: the demonstrations are of tasks with a known answer."""
 
+import contextlib
 import dataclasses
 import io
 import json
-import os
-import signal
 
 import jax
 import jax.numpy as jnp
@@ -14,8 +13,8 @@ from rich.console import Console
 from tiny import QUIET
 
 import milx
-from milx import recording, runs
-from milx.checkpoint import Checkpoints
+from milx import guard, recording, runs
+from milx.checkpoint import UNVALIDATED, Checkpoints
 from milx.data.dataset import DataSet, Writer
 from milx.methods.maml import MIL
 from milx.metrics import MetricsWriter
@@ -141,21 +140,30 @@ def test_an_interrupted_run_ends_bit_for_bit_like_the_uninterrupted_one(trained,
         with pytest.raises(KeyboardInterrupt):
             final(tmp_path / "stopped")
     with monkeypatch.context() as patch:
-        write = MetricsWriter.write
+        write, told = MetricsWriter.write, []
 
         def terminate(self, step, values):
-            os.kill(os.getpid(), signal.SIGTERM)
+            told.append(step)
             write(self, step, values)
 
         patch.setattr(MetricsWriter, "write", terminate)
+        patch.setattr(guard.Stop, "listen", contextlib.nullcontext)
+        patch.setattr(guard.Stop, "asked", property(lambda _: bool(told), lambda *_: None), raising=False)
         with pytest.raises(SystemExit) as ended:
             final(tmp_path / "terminated")
     assert ended.value.code == 0
     assert "milx: stopped at step 100; the same command goes on from there" in capsys.readouterr().out
     straight = final(tmp_path / "straight")
+    best = Checkpoints(tmp_path / "straight" / "checkpoints", read_only=True).best
     for name in ("stopped", "terminated"):
-        assert Checkpoints(tmp_path / name / "checkpoints", read_only=True).latest == 100
+        folder = tmp_path / name / "checkpoints"
+        before = Checkpoints(folder, read_only=True)
+        assert before.latest == 100
+        assert (before.score(100) == UNVALIDATED) == (name == "terminated")
         jax.tree.map(np.testing.assert_array_equal, final(tmp_path / name), straight)
+        after = Checkpoints(folder, read_only=True)
+        assert (after.latest, after.best) == (200, best)
+        assert after.score(100) > UNVALIDATED
 
 
 def test_bad_data_is_refused_before_anything_is_compiled(folder, tmp_path):
@@ -163,7 +171,7 @@ def test_bad_data_is_refused_before_anything_is_compiled(folder, tmp_path):
     for change, message in (
         ({"path": str(tmp_path)}, "data: .* has no zarr.json, expected a folder written by milx.data"),
         ({"goal_indices": (3,)}, r"recorded.goal_indices: got 3, expected less than 3"),
-        ({"horizon": 0}, r"recorded.horizon: got 0, expected at least 1"),
+        ({"horizon": 0}, r"recorded.horizon: got 0, expected a whole number, at least 1"),
         ({"gib": 1e-9}, r"recorded.gib: got 1e-09, expected at least"),
     ):
         bad = dataclasses.replace(config, recorded=dataclasses.replace(config.recorded, **change))
@@ -222,6 +230,8 @@ def test_data_that_are_not_finite_are_refused_by_name(tmp_path):
     demos[1].action[3, 0] = np.inf
     with Writer(tmp_path / "set", (12, 16), 3, 2, "a test") as writer:
         writer.add("lift", "train", [8, 8, 8], demos)
+        for split in ("validation", "test"):
+            writer.add(split, split, [8, 8], [random_demo(rng, np.ones(2), 8) for _ in range(2)])
     run = RecordedRun(tiny_config(tmp_path / "set"), tmp_path / "run", QUIET)
     with pytest.raises(
         ValueError, match=r"data: action of demonstration 1 of task 0 \('lift'\): got values that are not"

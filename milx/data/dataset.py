@@ -12,6 +12,7 @@ The header names every task, its split ("train", "validation" or "test") and the
 import dataclasses
 import hashlib
 import json
+import math
 import pathlib
 import shutil
 from collections.abc import Callable, Iterable
@@ -25,6 +26,8 @@ from milx.types import Demo
 
 VERSION = 1
 ALL_FIELDS = ("image", "state", "action")
+MAX_BYTES = 1 << 33
+"""Of an array that has to be in memory at once: a larger one is refused before there is memory for it."""
 _CHUNK_BYTES = 1 << 20
 _GROUP = {"zarr_format": 3, "node_type": "group"}
 
@@ -143,9 +146,12 @@ class Writer:
             for field, array in arrays.items():
                 value = np.asarray(getattr(demo, field))
                 expected = (length, *array.shape[1:])
+                where = f"demonstration {i} of {name!r}: {field}"
                 if value.shape != expected:
-                    where = f"demonstration {i} of {name!r}: {field}"
                     raise ValueError(f"{where}: got shape {list(value.shape)}, expected {list(expected)}")
+                if value.dtype != np.uint8 if field == "image" else value.dtype.kind not in "fiu":
+                    wanted = "uint8 in [0, 255]" if field == "image" else "real numbers"
+                    raise ValueError(f"{where}: got {value.dtype}, expected {wanted}")
                 array[start : start + length].write(value.astype(array.dtype.numpy_dtype)).result()
             start += length
         self._tasks.append(TaskInfo(name, split, tuple(lengths), tuple(has_action)))
@@ -189,10 +195,15 @@ class DataSet:
     ) -> Callable[[], Demo]:
         """Starts reading a demonstration; the result is a function that waits for it and returns it."""
         info = self.header.tasks[task]
-        index = np.arange(info.lengths[demo]) if frames is None else frames
-        rows = sum(info.lengths[:demo]) + index
         there = set(_fields(self.header)) - ({"action"} if not info.has_action[demo] else set())
-        begun = {field: self._array(task, field)[rows].read() for field in fields if field in there}
+        arrays = {field: self._array(task, field) for field in fields if field in there}
+        count = info.lengths[demo] if frames is None else len(frames)
+        for field, array in arrays.items():
+            check_size(
+                f"{self.folder}: {field} of {info.name!r}", (count, *array.shape[1:]), array.dtype.numpy_dtype.itemsize
+            )
+        rows = sum(info.lengths[:demo]) + (np.arange(count) if frames is None else frames)
+        begun = {field: array[rows].read() for field, array in arrays.items()}
 
         def finish() -> Demo:
             return Demo(**{field: future.result() for field, future in begun.items()})
@@ -214,6 +225,15 @@ class DataSet:
                 raise ValueError(f"{path}: got {got}, expected {np.dtype(dtype).name} {list(expected)}")
             self._arrays[key] = array
         return self._arrays[key]
+
+
+def check_size(field: str, shape: tuple[int, ...], itemsize: int) -> None:
+    """Raises ValueError for an array that no one can mean, before there is memory for it."""
+    size = itemsize * math.prod(int(n) for n in shape)
+    if size > MAX_BYTES:
+        raise ValueError(
+            f"{field}: got shape {list(shape)}, {size / 2**30:.3g} GiB, expected at most {MAX_BYTES >> 30}"
+        )
 
 
 def spread(length: int, horizon: int) -> np.ndarray:
@@ -281,7 +301,7 @@ def _parse_header(values: dict[str, Any]) -> Header:
         info = TaskInfo(task["name"], task["split"], tuple(task["lengths"]), tuple(task["has_action"]))
         if info.split not in SPLITS:
             raise ValueError(f"tasks[{i}].split: got {info.split!r}, expected one of {', '.join(SPLITS)}")
-        if not all(isinstance(length, int) and length > 0 for length in info.lengths):
+        if not all(isinstance(length, int) and 0 < length < 1 << 40 for length in info.lengths):
             raise ValueError(f"tasks[{i}].lengths: got {list(info.lengths)}, expected positive numbers")
         if len(info.has_action) != len(info.lengths):
             raise ValueError(f"tasks[{i}].has_action: got {len(info.has_action)}, expected {len(info.lengths)}")

@@ -7,6 +7,7 @@ import json
 import os
 import pathlib
 import sys
+import zipfile
 from collections.abc import Callable
 from typing import Any
 
@@ -222,7 +223,10 @@ def cached(
         digest.update(source.read_bytes())
     path = folder / f"{env.name}-{split}-{digest.hexdigest()[:16]}.npz"
     if parallel.on_all_hosts(path.is_file()):
-        return load(path, like=shapes(env, num_tasks, num_demos))
+        try:
+            return load(path, like=shapes(env, num_tasks, num_demos))
+        except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
+            print(f"milx: {path} is damaged and planned again: {error}", file=sys.stderr)
     demos = collect(env, jax.random.key(seed), split, num_tasks, num_demos, config)
     save(path, demos)
     return demos

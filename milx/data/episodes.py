@@ -15,8 +15,6 @@ from rich.progress import track
 from milx.data.dataset import Writer
 from milx.types import Demo
 
-MAX_BYTES = 1 << 33
-"""Of an array that has to be in memory at once: a larger one is refused before there is memory for it."""
 FLAGS = flags.FLAGS
 
 
@@ -113,8 +111,11 @@ def split_tasks(names: list[str], validation: float, test: float) -> dict[str, s
             raise ValueError(f"{field}: got {part}, expected a part of the tasks, at least 0 and less than 1")
     if validation + test >= 1:
         raise ValueError(f"validation + test: got {validation + test}, expected less than 1: the rest is for training")
+    if (needed := 1 + (validation > 0) + (test > 0)) > len(names):
+        raise ValueError(f"tasks: got {len(names)}, expected at least {needed}: one for each split")
     shuffled = sorted(names, key=lambda name: hashlib.sha256(name.encode()).digest())
-    first, second = round(validation * len(names)), round((validation + test) * len(names))
+    first = max(round(validation * len(names)), validation > 0)
+    second = first + max(round(test * len(names)), test > 0)
     of = lambda i: "validation" if i < first else "test" if i < second else "train"  # noqa: E731
     return {name: of(i) for i, name in enumerate(shuffled)}
 
@@ -151,10 +152,14 @@ def inside(root: pathlib.Path, path: str | pathlib.Path) -> pathlib.Path:
     Raises:
         ValueError: if that leads out of the data set's folder, by "..", an absolute path or a link, or to no file.
     """
-    found = (root / path).resolve()
+    try:
+        found = (root / path).resolve()
+        there = found.is_file()
+    except (OSError, RuntimeError, ValueError) as error:  # names that are too long, links that lead to themselves
+        raise ValueError(f"{root}: {str(path)[:200]} is no path: {error!r:.200}") from error
     if not found.is_relative_to(root.resolve()):
         raise ValueError(f"{root}: {path} leads out of the data set's folder")
-    if not found.is_file():
+    if not there:
         raise ValueError(f"{root}: {path} is missing")
     return found
 
@@ -171,15 +176,6 @@ def resized(images: Iterator[np.ndarray], shape: tuple[int, int]) -> Iterator[np
         if image.shape[:2] != shape:
             image = np.asarray(Image.fromarray(image).resize(shape[::-1], Image.Resampling.BOX))
         yield image
-
-
-def check_size(field: str, shape: tuple[int, ...], itemsize: int) -> None:
-    """Raises ValueError for an array that no one can mean, before there is memory for it."""
-    size = itemsize * int(np.prod([int(n) for n in shape], dtype=object))
-    if size > MAX_BYTES:
-        raise ValueError(
-            f"{field}: got shape {list(shape)}, {size / 2**30:.3g} GiB, expected at most {MAX_BYTES >> 30}"
-        )
 
 
 def _as_written(episode: Episode, sizes: Sizes) -> Demo:

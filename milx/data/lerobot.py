@@ -20,11 +20,12 @@ from absl import app
 from PIL import Image
 
 from milx.data import episodes as shared
+from milx.data.dataset import check_size
 from milx.data.episodes import Episode, Sizes
 from milx.types import Demo
 
 _CONVERTER = "python -m lerobot.datasets.v30.convert_dataset_v21_to_v30"
-_PLACEHOLDER = re.compile(r"\{(\w+)(?::0?(\d+)d)?\}")
+_PLACEHOLDER = re.compile(r"\{(\w+)(?::0?(\d)d)?\}")
 
 
 class LeRobot:
@@ -73,7 +74,9 @@ class LeRobot:
 
     def _read(self, row: dict[str, Any], file: pathlib.Path) -> Demo:
         length, number = row["length"], row["episode_index"]
-        table = _read_table(file)
+        is_video = bool(self.camera) and self.info["features"][self.camera]["dtype"] == "video"
+        columns = ("episode_index", self.state, self.action, "" if is_video else self.camera)
+        table = _read_table(file, tuple(name for name in columns if name))
         kept = np.flatnonzero(table["episode_index"].to_numpy() == number)
         if len(kept) != length:
             raise ValueError(f"{file}: got {len(kept)} rows of episode {number}, expected {length}")
@@ -91,8 +94,7 @@ class LeRobot:
         action = vectors(self.action, self.sizes.action) if self.action else None
         image = None
         if self.sizes.image_shape is not None:
-            shared.check_size(f"{self.camera} of episode {number}", (length, *self.sizes.image_shape, 3), 1)
-            is_video = self.info["features"][self.camera]["dtype"] == "video"
+            check_size(f"{self.camera} of episode {number}", (length, *self.sizes.image_shape, 3), 1)
             frames = self._video(row) if is_video else _images(file, table[self.camera].take(kept).to_pylist())
             image = np.stack(list(shared.resized(frames, self.sizes.image_shape)))
         return Demo(image, state, action)
@@ -113,20 +115,29 @@ class LeRobot:
             columns += [f"{prefix}/chunk_index", f"{prefix}/file_index", f"{prefix}/from_timestamp"]
         rows = []
         for path in sorted((self.root / "meta" / "episodes").glob("*/*.parquet")):
-            table = _read_table(shared.inside(self.root, path.relative_to(self.root)))
-            if missing := sorted(set(columns) - set(table.column_names)):
-                raise ValueError(f"{path}: has no column {missing[0]!r}")
-            rows += table.select(columns).to_pylist()
+            rows += _read_table(shared.inside(self.root, path.relative_to(self.root)), tuple(columns)).to_pylist()
         if not rows:
             raise ValueError(f"{self.root}: meta/episodes holds no episodes")
         for row in rows:
-            if not isinstance(row["length"], int) or row["length"] < 1:
-                raise ValueError(
-                    f"{self.root}: episode {row['episode_index']}: length: got {row['length']}, expected > 0"
-                )
-            if not row["tasks"]:
-                raise ValueError(f"{self.root}: episode {row['episode_index']} has no task")
+            self._check_row(row)
         return sorted(rows, key=lambda row: row["episode_index"])
+
+    def _check_row(self, row: dict[str, Any]) -> None:
+        """Raises ValueError for an entry of meta/episodes that cannot be."""
+        where = f"{self.root}: episode {row['episode_index']!r:.20}"
+        for name, value in row.items():
+            if name == "tasks":
+                good, expected = isinstance(value, list) and len(value) > 0, "at least one"
+            elif name.endswith("timestamp"):
+                good, expected = isinstance(value, float) and 0 <= value < 1e7, "seconds, at least 0"
+            else:
+                least = 1 if name == "length" else 0
+                good, expected = (
+                    isinstance(value, int) and least <= value < 1 << 40,
+                    f"a whole number, at least {least}",
+                )
+            if not good:
+                raise ValueError(f"{where}: {name}: got {value!r:.100}, expected {expected}")
 
     def _data_file(self, row: dict[str, Any]) -> pathlib.Path:
         values = {name: row[f"data/{name}"] for name in ("chunk_index", "file_index")}
@@ -137,7 +148,7 @@ class LeRobot:
         if not path.is_file():
             raise ValueError(f"{self.root} has no meta/info.json, expected a LeRobot data set")
         try:
-            info = json.loads(path.read_text())
+            info = json.loads(shared.inside(self.root, "meta/info.json").read_text())
             version = str(info["codebase_version"])
             features, fps = info["features"], info["fps"]
         except (KeyError, TypeError, ValueError) as error:
@@ -228,7 +239,8 @@ def _fill(template: Any, values: dict[str, Any]) -> str:
 
 
 @functools.lru_cache(maxsize=4)
-def _read_table(file: pathlib.Path) -> Any:
+def _read_table(file: pathlib.Path, columns: tuple[str, ...]) -> Any:
+    """Some columns of a parquet file, unless they are missing or too large."""
     try:
         import pyarrow
         import pyarrow.parquet
@@ -236,10 +248,13 @@ def _read_table(file: pathlib.Path) -> Any:
         raise ValueError("reading LeRobot data needs the package pyarrow: pip install 'milx[lerobot]'") from error
     try:
         metadata = pyarrow.parquet.read_metadata(file)
-        shared.check_size(
-            str(file), (sum(metadata.row_group(i).total_byte_size for i in range(metadata.num_row_groups)),), 1
-        )
-        return pyarrow.parquet.read_table(file)
+        if missing := sorted(set(columns) - set(metadata.schema.to_arrow_schema().names)):
+            raise ValueError(f"{file}: has no column {missing[0]!r}")
+        groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
+        parts = [group.column(i) for group in groups for i in range(group.num_columns)]
+        wanted = [part for part in parts if part.path_in_schema.startswith(columns)]
+        check_size(str(file), (sum(max(part.total_uncompressed_size, 8 * part.num_values) for part in wanted),), 1)
+        return pyarrow.parquet.read_table(file, columns=list(columns))
     except (pyarrow.ArrowException, OSError) as error:
         raise ValueError(f"{file}: no parquet file that can be read: {error}") from error
 

@@ -136,13 +136,15 @@ class Shards:
         horizon: T.
         gib: room for a shard; two are on the device at times.
         seed: draws the shards.
+        acting: at least so many demonstrations of a task that show actions are in a shard, if it has as many.
 
     Raises:
         ValueError: if not even one task fits.
     """
 
-    def __init__(self, data: DataSet, tasks: Sequence[int], horizon: int, gib: float, seed: int):
+    def __init__(self, data: DataSet, tasks: Sequence[int], horizon: int, gib: float, seed: int, acting: int):
         self.data, self.tasks, self.horizon, self.seed = data, list(tasks), horizon, seed
+        self.acting = acting
         most = max(len(data.header.tasks[i].lengths) for i in self.tasks)
         self.num_demos = min(most, MOST_DEMOS)
         of_task = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(shape_of(data, 1, self.num_demos, horizon)))
@@ -181,6 +183,8 @@ class Shards:
         tasks = self.tasks if self.whole else rng.choice(self.tasks, self.num_tasks, replace=False).tolist()
         demos = []
         for task in tasks:
-            count = len(self.data.header.tasks[task].lengths)
-            demos.append(sorted(rng.choice(count, min(count, self.num_demos), replace=False).tolist()))
+            order = rng.permutation(len(self.data.header.tasks[task].lengths))
+            acts = np.array(self.data.header.tasks[task].has_action)[order]
+            first = acts & (acts.cumsum() <= self.acting)
+            demos.append(sorted(np.concatenate([order[first], order[~first]])[: self.num_demos].tolist()))
         return tasks, demos

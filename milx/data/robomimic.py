@@ -15,6 +15,7 @@ import numpy as np
 from absl import app
 
 from milx.data import episodes as shared
+from milx.data.dataset import check_size
 from milx.data.episodes import Episode, Sizes
 from milx.types import Demo
 
@@ -35,7 +36,9 @@ class Robomimic:
 
     def __init__(self, path: str | pathlib.Path, camera: str | None, state: str, action: str, height: int):
         root = pathlib.Path(path)
-        self.files = sorted(root.glob("*.hdf5")) if root.is_dir() else [root]
+        self.files = [root]
+        if root.is_dir():
+            self.files = [shared.inside(root, file.name) for file in sorted(root.glob("*.hdf5"))]
         if not self.files or not self.files[0].is_file():
             raise ValueError(f"{path}: expected a file in robomimic's layout, or a folder of *.hdf5 files")
         self.state, self.action = [name for name in state.split(",") if name], action
@@ -134,7 +137,7 @@ def _dataset(file: Any, name: str, axes: int) -> Any:
         raise ValueError(f"{where}: is stored outside the file, which is not read")
     if found.ndim != axes or found.dtype.kind not in "fiu":
         raise ValueError(f"{where}: got {found.dtype} {list(found.shape)}, expected numbers with {axes} axes")
-    shared.check_size(where, found.shape, found.dtype.itemsize)
+    check_size(where, found.shape, found.dtype.itemsize)
     return found
 
 
@@ -148,14 +151,15 @@ def _members(file: Any, name: str) -> list[str]:
 
 
 def _check_links(file: Any, name: str) -> None:
-    """Raises ValueError if the way to `name` leads through another file."""
+    """Raises ValueError if the way to `name` leads out of the file; no link of another file is opened."""
     import h5py
 
-    parts = name.split("/")
-    for i in range(1, len(parts) + 1):
-        link = file.get("/".join(parts[:i]), getlink=True)
-        if isinstance(link, h5py.ExternalLink):
-            raise ValueError(f"{file.filename}: {name}: leads out of the file, to {link.filename}")
+    at = file
+    for part in name.split("/"):
+        link = at.get(part, getlink=True) if isinstance(at, h5py.Group) else None
+        if isinstance(link, h5py.ExternalLink | h5py.SoftLink):
+            raise ValueError(f"{file.filename}: {name}: {part} leads out of its group by a link, which is not followed")
+        at = None if link is None else at.get(part)
 
 
 def main(argv: list[str]) -> None:

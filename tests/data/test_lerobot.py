@@ -172,8 +172,11 @@ def test_a_linked_episodes_folder_is_not_followed(copy):
         (lambda root: (root / f"videos/{TOP}/chunk-000/file-000.mp4").unlink(), "file-000.mp4 is missing"),
         (lambda root: change_episodes(root, f"videos/{TOP}/from_timestamp", 60.0), "has no frame at 60.000 s"),
         (lambda root: change_episodes(root, "length", 10**6), "got 12 rows of episode 0, expected 1000000"),
-        (lambda root: change_episodes(root, "length", 0), "length: got 0, expected > 0"),
-        (lambda root: change_episodes(root, "tasks", []), "episode 0 has no task"),
+        (
+            lambda root: change_episodes(root, "length", 0),
+            "episode 0: length: got 0, expected a whole number, at least 1",
+        ),
+        (lambda root: change_episodes(root, "tasks", []), r"episode 0: tasks: got \[\], expected at least one"),
     ],
 )
 def test_damaged_sets_are_refused(copy, damage, message):

@@ -92,11 +92,15 @@ def enormous(path):
         ),
         (lambda path: replace(path, "data/demo_0/actions", np.zeros((6, 4))), "got lengths"),
         (lambda path: replace(path, "data/demo_0/obs/agentview_image", np.zeros((7, 20, 30, 3))), "expected uint8"),
-        (lambda path: replace(path, "data", h5py.ExternalLink("/etc/passwd", "/")), "data: leads out of the file"),
+        (
+            lambda path: replace(path, "data", h5py.ExternalLink("/etc/passwd", "/")),
+            "data: data leads out of its group",
+        ),
         (
             lambda path: replace(path, "data/demo_0/actions", h5py.ExternalLink("../x.hdf5", "/a")),
-            "leads out of the file",
+            "actions leads out of its group",
         ),
+        (lambda path: replace(path, "data/demo_0/obs", h5py.SoftLink("/hidden")), "obs leads out of its group"),
         (virtual, "is stored outside the file"),
         (external, "is stored outside the file"),
         (enormous, r"got shape \[1000000000, 4\], 29.8 GiB, expected at most 8"),
