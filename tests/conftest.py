@@ -39,7 +39,10 @@ class Trained:
         return [json.loads(line) for line in (self.folder / "metrics.jsonl").read_text().splitlines()]
 
 
-FIRST = ("test_run.py", "test_parallel.py", "test_cells.py", "test_demos.py", "test_evaluator.py", "test_policy.py")
+FIRST = (
+    *("test_run.py", "test_notebook.py", "test_parallel.py"),
+    *("test_cells.py", "test_demos.py", "test_evaluator.py", "test_policy.py"),
+)
 """The files that take longest, so that in the end no process is left alone with one of them."""
 
 
@@ -53,7 +56,7 @@ class Scheduling(LoadScopeScheduling):
 
     def _split_scope(self, nodeid: str) -> str:
         file = nodeid.split("::")[0]
-        looks = pathlib.Path(file).name in FIRST and not file.endswith("test_parallel.py")
+        looks = pathlib.Path(file).name in FIRST and not file.endswith(("test_parallel.py", "test_notebook.py"))
         return "the tiny run" if looks else file
 
 
