@@ -21,6 +21,7 @@ from milx.config import Config
 from milx.data import demos as demos_lib
 from milx.data.demos import DemoSet
 from milx.policy import spec_of
+from milx.presets import make_config
 from milx.run import check_steps, initial_state
 from milx.simulation import split_demos, training_on, trial_key
 from milx.trainer import Trainer, make_optimizer
@@ -64,7 +65,7 @@ def configure(env: str, method: str, preset: str, seed: int, steps: int | None) 
     A small set of demonstrations is to be small in colours and places, too. On vision reach eight time steps of the
     query and three layers learn faster than the three and two of `fast`, which end a little higher.
     """
-    config = config_lib.make_config(env, method, preset, seed)
+    config = make_config(env, method, preset, seed)
     config.train.steps = steps or STEPS[env]
     config.train.eval_every = min(4000, config.train.steps)
     config.train.redraw = False

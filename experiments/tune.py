@@ -13,7 +13,8 @@ from absl import app, flags
 
 from milx import config as config_lib
 from milx import provenance
-from milx.config import Config, make_config
+from milx.config import Config
+from milx.presets import make_config
 
 CANDIDATES = {
     "3e-4": (3e-4, True),

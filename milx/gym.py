@@ -17,9 +17,10 @@ import numpy as np
 from gymnasium import spaces
 
 from milx import envs
-from milx.config import DataConfig, make_config
+from milx.config import DataConfig
 from milx.data.demos import render_demo
 from milx.envs.base import State
+from milx.presets import make_config
 from milx.trajopt.expert import perform
 from milx.trajopt.ilqr import Options
 from milx.types import Demo

@@ -9,8 +9,8 @@ from absl import app, flags, logging
 from ml_collections import config_flags
 
 from milx import config as config_lib
-from milx import guard, parallel, recording
-from milx.config import PRESETS, Config
+from milx import guard, parallel, presets, recording
+from milx.config import Config
 from milx.envs import ENVS
 from milx.methods import METHODS
 
@@ -55,7 +55,7 @@ def run(main: Callable[[Config, str], None]) -> None:
             raise app.UsageError(f"unexpected argument {argv[1]!r}")
         config = FLAGS.config
         if FLAGS.preset is None:
-            others = ", ".join(f"--preset={name}" for name in PRESETS[config.env_name] if name != config.preset)
+            others = ", ".join(f"--preset={name}" for name in presets.PRESETS[config.env_name] if name != config.preset)
             print(f"Running on {jax.default_backend()} with its default, --preset={config.preset}; also: {others}.")
         what = config.env_name if FLAGS.data is None else pathlib.Path(FLAGS.data).resolve().name
         name = f"{what}-{config.method_name}-{config.preset}-{config.seed}"
@@ -76,7 +76,7 @@ def _parse(argv: Sequence[str]) -> list[str]:
     preset = FLAGS.preset or ("cpu" if jax.default_backend() == "cpu" else "fast")
     try:
         if FLAGS.data is None:
-            config = config_lib.make_config(FLAGS.env, FLAGS.method, preset, FLAGS.seed)
+            config = presets.make_config(FLAGS.env, FLAGS.method, preset, FLAGS.seed)
         else:
             config = recording.make_config(FLAGS.data, FLAGS.method, preset, FLAGS.seed)
     except ValueError as error:

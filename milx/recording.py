@@ -14,8 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 
-from milx import config as config_lib
-from milx import report, results, validate, whitening
+from milx import presets, report, results, validate, whitening
 from milx.config import GIVEN, Config
 from milx.data.dataset import DataSet, spread
 from milx.data.recorded import MOST_DEMOS, Recorded, Shards, load, sample_batch, with_goals
@@ -34,7 +33,7 @@ def make_config(path: str | pathlib.Path, method: str = "mil", preset: str = "fa
     Raises:
         ValueError: for a path that holds no data set, or a preset that does not exist.
     """
-    config, head = config_lib.make_config(RECORDED, method, preset, seed), DataSet(path).header
+    config, head = presets.make_config(RECORDED, method, preset, seed), DataSet(path).header
     config.recorded.path = str(path)
     if head.image_shape is None:
         config.network.filters = config.network.strides = ()

@@ -6,7 +6,7 @@ import pathlib
 from typing import Any
 
 from milx import config as config_lib
-from milx import provenance
+from milx import presets, provenance
 from milx.config import Config
 
 
@@ -26,7 +26,7 @@ def describe(
         "env": config.env_name,
         "method": config.method_name,
         "preset": config.preset,
-        "variant": ", ".join(f"{name}={value}" for name, value in config_lib.overrides(config).items()),
+        "variant": ", ".join(f"{name}={value}" for name, value in presets.overrides(config).items()),
         "seed": config.seed,
         **found,
         "wall_clock_s": seconds,

@@ -18,13 +18,14 @@ from hypothesis import strategies as st
 
 from milx import config as config_lib
 from milx import recording
-from milx.config import GIVEN, PRESETS, make_config
+from milx.config import GIVEN
 from milx.data import lerobot
 from milx.data.dataset import DataSet, Writer
 from milx.data.lerobot import LeRobot
 from milx.data.robomimic import Robomimic
 from milx.methods import Spec
 from milx.policy import check_demo, check_observation
+from milx.presets import PRESETS, make_config
 from milx.types import Demo, Observation
 
 CASES = {"demos": 700, "observations": 300, "configs": 500, "headers": 400, "lerobot": 250, "robomimic": 150}

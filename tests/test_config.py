@@ -7,8 +7,9 @@ import pytest
 
 from milx import config as config_lib
 from milx import methods
-from milx.config import PRESETS, Config, make_config
+from milx.config import Config
 from milx.methods import Spec
+from milx.presets import PRESETS, make_config, overrides
 
 ALL = [(env, preset) for env, presets in PRESETS.items() for preset in presets]
 
@@ -91,9 +92,9 @@ def test_differences_name_the_fields():
 
 def test_overrides_are_what_differs_from_the_preset():
     config = make_config("reach", preset="cpu", seed=3)
-    assert config_lib.overrides(config) == {}
+    assert overrides(config) == {}
     config.network.filters, config.mil.inner_steps = (1, 2), 5
-    assert config_lib.overrides(config) == {"network.filters": (1, 2), "mil.inner_steps": 5}
+    assert overrides(config) == {"network.filters": (1, 2), "mil.inner_steps": 5}
 
 
 def test_fields_are_assigned_by_name_and_only_optional_ones_take_none():
@@ -101,7 +102,7 @@ def test_fields_are_assigned_by_name_and_only_optional_ones_take_none():
     assert config.train.support_frames is not None
     config_lib.assign(config, "train.support_frames", None)
     config_lib.assign(config, "mil.inner_steps", 3)
-    assert config_lib.overrides(config) == {"train.support_frames": None, "mil.inner_steps": 3}
+    assert overrides(config) == {"train.support_frames": None, "mil.inner_steps": 3}
     with pytest.raises(ValueError, match=r"config\.train\.steps: got None, expected a value"):
         config_lib.assign(config, "train.steps", None)
     with pytest.raises(ValueError, match=r"config\.train\.stepz: no such field"):

@@ -11,9 +11,9 @@ import pytest
 
 import milx
 from milx import methods
-from milx.config import make_config
 from milx.export import export
 from milx.policy import Policy, spec_of
+from milx.presets import make_config
 from milx.whitening import Whitening
 
 T = 50

@@ -6,8 +6,8 @@ import pytest
 
 import milx
 from milx import pretrained
-from milx.config import make_config
 from milx.policy import Policy
+from milx.presets import make_config
 
 
 @pytest.mark.parametrize("name", pretrained.names())

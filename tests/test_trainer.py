@@ -5,7 +5,8 @@ import numpy as np
 import optax
 import pytest
 
-from milx.config import PRESETS, OptimizerConfig
+from milx.config import OptimizerConfig
+from milx.presets import PRESETS
 from milx.trainer import make_optimizer
 
 STEPS = 40

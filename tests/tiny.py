@@ -2,7 +2,8 @@
 
 from rich.console import Console
 
-from milx.config import Config, make_config
+from milx.config import Config
+from milx.presets import make_config
 
 QUIET = Console(quiet=True)
 

@@ -23,11 +23,11 @@ import pyarrow.parquet
 from absl import app, flags
 
 from milx import envs, methods
-from milx.config import make_config
 from milx.data import episodes
 from milx.data.lerobot import LeRobot
 from milx.export import export
 from milx.policy import Policy, spec_of
+from milx.presets import make_config
 from milx.whitening import Whitening
 
 _OUT = flags.DEFINE_string("out", "experiments/results/benchmarks", "Folder of the JSON file.")

@@ -13,7 +13,7 @@ import workload
 from absl import app, flags
 
 from milx import envs
-from milx.config import make_config
+from milx.presets import make_config
 
 _OUT = flags.DEFINE_string("out", str(common.RESULTS), "Folder of the JSON file.")
 _TINY = flags.DEFINE_bool("tiny", False, "One size of each, for a try.")

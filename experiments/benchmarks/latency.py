@@ -17,10 +17,11 @@ from absl import app, flags
 from jax.experimental.compilation_cache import compilation_cache
 
 from milx import envs, evaluator, methods, platform
-from milx.config import Config, make_config
+from milx.config import Config
 from milx.data.demos import sampler
 from milx.envs.base import Env
 from milx.policy import Policy, spec_of
+from milx.presets import make_config
 from milx.trainer import Trainer, make_optimizer
 from milx.trajopt.expert import perform
 from milx.trajopt.ilqr import Options

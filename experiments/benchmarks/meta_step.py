@@ -24,11 +24,12 @@ import workload
 from absl import app, flags
 
 from milx import envs, methods, platform
-from milx.config import Config, make_config
+from milx.config import Config
 from milx.envs.base import Env
 from milx.methods.base import Method
 from milx.networks import layers
 from milx.policy import spec_of
+from milx.presets import make_config
 from milx.trainer import meta_gradient
 from milx.types import Params, TaskBatch
 
