@@ -82,9 +82,9 @@ def writing(workdir: pathlib.Path, before: set[str]) -> bool:
 
 
 def unfinished(workdir: pathlib.Path) -> set[str]:
-    """The names of checkpoints that are not complete."""
-    names = {path.name for path in (workdir / "checkpoints").glob("*")}
-    return {name for name in names if "tmp" in name or "checksums" in name}
+    """Checkpoints that are not complete."""
+    checkpoints = workdir / "checkpoints"
+    return {str(path) for pattern in ("*tmp*", "*/checksums.json.partial") for path in checkpoints.glob(pattern)}
 
 
 def last_step(workdir: pathlib.Path) -> int:

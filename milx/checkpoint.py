@@ -4,6 +4,7 @@ A checkpoint that is damaged is reported and the one before it is used. In a run
 `damaged/` beside the checkpoints, so that nothing is lost and its step can be written again.
 """
 
+import contextlib
 import hashlib
 import json
 import os
@@ -45,6 +46,7 @@ class Checkpoints:
 
     def __init__(self, folder: pathlib.Path, read_only: bool = False, report: Callable[[str], None] = _to_stderr):
         self.folder, self._read_only, self._report = folder.absolute(), read_only, report
+        self._view: tempfile.TemporaryDirectory | None = None
         self._manager = self._open(self._without_damaged())
 
     @property
@@ -103,7 +105,7 @@ class Checkpoints:
             restored = self._manager.restore(step, args=ocp.args.Composite(**restores, extra=ocp.args.JsonRestore()))
         except Exception as error:  # Orbax and tensorstore have many types
             reason = f"{type(error).__name__}: {str(error).strip().splitlines()[0]}"
-            expected = "what this version of milx writes; the result file of a run names its version"
+            expected = f"what this version of milx writes; it is of {self._origin(step)}"
             raise ValueError(
                 f"{self.folder / str(step)}: cannot be restored, expected {expected} ({reason})"
             ) from error
@@ -123,6 +125,16 @@ class Checkpoints:
     def close(self) -> None:
         """Ends Orbax's threads."""
         self._manager.close()
+        if self._view:
+            self._view.cleanup()
+
+    def _origin(self, step: int) -> str:
+        """Which version of milx wrote a checkpoint, for a message."""
+        try:
+            extra = self._manager.restore(step, args=ocp.args.Composite(extra=ocp.args.JsonRestore()))["extra"]
+            return " and ".join(f"{name} {version}" for name, version in extra["versions"].items())
+        except Exception:  # it is the second thing to fail
+            return "an unknown version"
 
     def _open(self, folder: pathlib.Path) -> ocp.CheckpointManager:
         keep = policies.AnyPreservationPolicy(
@@ -145,26 +157,29 @@ class Checkpoints:
         if damage and len(damage) == len(steps):
             raise ValueError(f"checkpoints: all in {self.folder} are damaged, expected at least one that is not")
         if self._read_only and damage:
-            view = pathlib.Path(tempfile.mkdtemp())
+            self._view = tempfile.TemporaryDirectory()
             for path in set(steps) - set(damage):
-                (view / path.name).symlink_to(path)
-            return view
-        if parallel.is_first_host() and not self._read_only:
-            for path in damage:
-                _move_aside(path)
-            for path in set(steps) - set(damage):
-                if not (path / _CHECKSUMS).is_file():  # of an earlier version, or the process was killed just then
-                    _write_checksums(path)
+                (pathlib.Path(self._view.name) / path.name).symlink_to(path)
+            return pathlib.Path(self._view.name)
+        if not self._read_only:
+            parallel.wait_for_all()  # every host has looked
+            if parallel.is_first_host():
+                for path in damage:
+                    _move_aside(path)
+                for path in set(steps) - set(damage):
+                    if not (path / _CHECKSUMS).is_file():  # of an earlier version, or the process was killed just then
+                        _write_checksums(path)
+            parallel.wait_for_all()
         return self.folder
 
 
 def _damage(checkpoint: pathlib.Path) -> str | None:
-    """What is wrong with a checkpoint's files; None if nothing is, or it was written before there were checksums."""
+    """What is wrong with a checkpoint's files; None if nothing is."""
     path = checkpoint / _CHECKSUMS
     if not (checkpoint / _METADATA).is_file():
         return f"{_METADATA} is missing"
     if not path.is_file():
-        return None
+        return _unreadable(checkpoint)
     try:
         expected = dict(json.loads(path.read_text()))
     except ValueError:
@@ -178,13 +193,24 @@ def _damage(checkpoint: pathlib.Path) -> str | None:
     return None if expected else f"{_CHECKSUMS} is empty"
 
 
+def _unreadable(checkpoint: pathlib.Path) -> str | None:
+    """What keeps the arrays of a checkpoint without checksums from being read; None if nothing does."""
+    with contextlib.closing(ocp.StandardCheckpointer()) as reader:
+        for item in sorted(path.parent for path in checkpoint.glob("*/manifest.ocdbt")):
+            try:
+                reader.restore(item)
+            except Exception as error:  # Orbax and tensorstore have many types
+                return f"{item.name} cannot be read ({type(error).__name__})"
+    return None
+
+
 def _checksums(checkpoint: pathlib.Path) -> dict[str, str]:
-    files = sorted(path for path in checkpoint.rglob("*") if path.is_file() and path.name != _CHECKSUMS)
+    files = sorted(path for path in checkpoint.rglob("*") if path.is_file() and _CHECKSUMS not in path.name)
     return {str(path.relative_to(checkpoint)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
 def _write_checksums(checkpoint: pathlib.Path) -> None:
-    partial = checkpoint.with_name(f"{checkpoint.name}.checksums")
+    partial = checkpoint / f"{_CHECKSUMS}.partial"
     with partial.open("w") as file:
         file.write(json.dumps(_checksums(checkpoint), indent=1))
         file.flush()

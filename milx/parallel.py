@@ -41,6 +41,11 @@ def on_all_hosts(condition: bool) -> bool:
     return bool(multihost_utils.process_allgather(np.array(condition)).all())
 
 
+def wait_for_all() -> None:
+    """Until every process is here."""
+    on_all_hosts(True)
+
+
 def on_any_host(condition: bool) -> bool:
     """Whether the condition holds in some process; all have to ask."""
     return not on_all_hosts(not condition)

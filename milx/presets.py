@@ -231,7 +231,5 @@ def make_config(env: str, method: str = "mil", preset: str = "fast", seed: int =
 def overrides(config: Config) -> dict[str, Any]:
     """The fields, by dotted name, in which a configuration differs from its preset."""
     preset = make_config(config.env_name, config.method_name, config.preset, config.seed)
-    before = config_lib.flatten(config_lib.to_dict(preset))
-    return {
-        name: value for name, value in config_lib.flatten(config_lib.to_dict(config)).items() if value != before[name]
-    }
+    before, now = (config_lib.flatten(config_lib.to_dict(each)) for each in (preset, config))
+    return {name: value for name, value in now.items() if value != before[name]}

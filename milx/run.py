@@ -27,7 +27,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from milx import config as config_lib
-from milx import guard, methods, parallel, platform, results
+from milx import guard, methods, parallel, platform, provenance, results
 from milx.checkpoint import UNVALIDATED, Checkpoints
 from milx.config import Config
 from milx.methods import Spec
@@ -163,6 +163,9 @@ class Run(abc.ABC):
         """
         stop = guard.Stop()
         with guard.one_trainer(self.folder), stop.listen():
+            self._claim_folder()  # another process may have written its own configuration before this one had the lock
+            for leftover in self.folder.glob("*.partial*"):
+                leftover.unlink()
             self._train(stop)
 
     def _train(self, stop: guard.Stop) -> None:
@@ -183,6 +186,7 @@ class Run(abc.ABC):
         def save(state: TrainState, score: float, write: Callable[..., bool]) -> bool:
             items = {"params": state.params, "trainer": (state.step, state.optimizer)}
             extra = {"seconds": self._elapsed(), "dataset_hash": training.dataset_hash}
+            extra["versions"] = provenance.versions(("milx", "jax", "orbax-checkpoint"))
             return write(int(state.step), items, score if np.isfinite(score) else UNVALIDATED, extra)
 
         def validate_now(state: TrainState) -> float:

@@ -2,6 +2,7 @@
 
 import errno
 import json
+import pathlib
 import resource
 import signal
 
@@ -140,11 +141,34 @@ def test_checkpoints_without_checksums_load(folder, tmp_path):
     assert not reports
 
 
+def test_a_truncated_one_without_checksums_is_passed_over(folder, tmp_path):
+    mine, reports = copy(folder, tmp_path / "checkpoints"), []
+    (mine / "20" / "checksums.json").unlink()
+    for name in files(folder):
+        if name.parts[1] == "params" and "d" in name.parts:
+            DAMAGES["truncated"](mine / name)
+    checkpoints = Checkpoints(mine, read_only=True, report=reports.append)
+    assert restored(checkpoints, checkpoints.latest) == {"number": 0}
+    assert "20 is damaged and not used: params cannot be read" in reports[0]
+    view = checkpoints._view.name
+    checkpoints.close()
+    assert not pathlib.Path(view).exists()
+
+
 def test_other_items_are_refused_with_a_reason(folder):
     checkpoints = Checkpoints(folder, read_only=True)
     for like in ({"params": {"a": jnp.zeros((3, 4))}}, {"params": {"a": jnp.zeros((9, 9)), "b": jnp.zeros(5)}}):
-        with pytest.raises(ValueError, match=r"20: cannot be restored, expected what this version of milx writes"):
+        expected = "20: cannot be restored, expected what this version of milx writes; it is of an unknown version"
+        with pytest.raises(ValueError, match=expected):
             checkpoints.restore(20, like)
+
+
+def test_a_refusal_names_the_version_that_wrote_it(tmp_path):
+    checkpoints = Checkpoints(tmp_path / "checkpoints")
+    checkpoints.save(10, items(10), 0.5, {"versions": {"milx": "9.8.7", "jax": "0.1"}})
+    with pytest.raises(ValueError, match=r"it is of milx 9\.8\.7 and jax 0\.1 "):
+        checkpoints.restore(10, {"params": {"other": jnp.zeros(3)}})
+    checkpoints.close()
 
 
 def test_the_best_is_kept_and_one_that_nobody_validated_is_the_best_only_if_alone(tmp_path):
