@@ -1,5 +1,6 @@
 """What the launchers share: flags that everybody sets, and overrides of single configuration fields."""
 
+import functools
 import pathlib
 import sys
 from collections.abc import Callable, Sequence
@@ -19,33 +20,34 @@ _OWN_FLAGS = {"env_name": "env", "method_name": "method", "preset": "preset", "s
 flags.disclaim_key_flags()  # so that --help of a launcher lists the flags defined here
 
 
-def define_flags() -> None:
+def define_flags(values: flags.FlagValues = FLAGS) -> None:
     """Defines --env, --method, --preset, --seed, --workdir and what several hosts need."""
-    flags.DEFINE_string("env", "reach", f"Environment: {', '.join(ENVS)}.")
-    flags.DEFINE_string("data", None, "Folder of recorded demonstrations (milx.data), instead of an environment.")
-    flags.DEFINE_string("method", "mil", f"Method: {', '.join(METHODS)}.")
-    flags.DEFINE_string(
+    string, integer = (
+        functools.partial(define, flag_values=values) for define in (flags.DEFINE_string, flags.DEFINE_integer)
+    )
+    string("env", "reach", f"Environment: {', '.join(ENVS)}.")
+    string("data", None, "Folder of recorded demonstrations (milx.data), instead of an environment.")
+    string("method", "mil", f"Method: {', '.join(METHODS)}.")
+    string(
         "preset",
         None,
         "Hyperparameters: paper (as published; not for reach_state), fast (for an accelerator, its default), cpu "
         "(smaller images and networks; the default without an accelerator). --config.path.to.field=value changes any "
         "of them.",
     )
-    flags.DEFINE_integer("seed", 0, "Seed of training tasks, initial parameters and batches.", lower_bound=0)
-    flags.DEFINE_string(
-        "coordinator", None, "Several hosts outside SLURM and Cloud TPU: address:port of the first one."
-    )
-    flags.DEFINE_integer("num_processes", None, "With --coordinator: how many hosts there are.", lower_bound=1)
-    flags.DEFINE_integer("process_id", None, "With --coordinator: this host's number, from 0.", lower_bound=0)
-    flags.DEFINE_string("workdir", None, "Folder of the run; default runs/<env>-<method>-<preset>-<seed>.")
+    integer("seed", 0, "Seed of training tasks, initial parameters and batches.", lower_bound=0)
+    string("coordinator", None, "Several hosts outside SLURM and Cloud TPU: address:port of the first one.")
+    integer("num_processes", None, "With --coordinator: how many hosts there are.", lower_bound=1)
+    integer("process_id", None, "With --coordinator: this host's number, from 0.", lower_bound=0)
+    string("workdir", None, "Folder of the run; default runs/<env>-<method>-<preset>-<seed>.")
 
 
 def run(main: Callable[[Config, str], None]) -> None:
     """Parses the command line and calls `main(config, workdir)`; bad input ends with a message, not a traceback."""
 
-    def parse(argv: Sequence[str]) -> list[str]:
+    def parse_or_exit(argv: Sequence[str]) -> list[str]:
         try:
-            return _parse(argv)
+            return parse(argv)
         except flags.Error as error:
             sys.exit(f"milx: {error}")
 
@@ -65,20 +67,24 @@ def run(main: Callable[[Config, str], None]) -> None:
         except (ValueError, OSError) as error:
             sys.exit(f"milx: {error}")
 
-    app.run(start, flags_parser=parse)
+    app.run(start, flags_parser=parse_or_exit)
 
 
-def _parse(argv: Sequence[str]) -> list[str]:
-    """Parses the flags, then the overrides of the configuration that they choose; returns what is left."""
+def parse(argv: Sequence[str], values: flags.FlagValues = FLAGS) -> list[str]:
+    """Parses the flags, then the overrides of the configuration that they choose; returns what is left.
+
+    Raises:
+        flags.Error: for a flag, field or value that cannot be.
+    """
     own = [arg for arg in argv if not arg.startswith(("--config", "-config"))]
-    FLAGS(own)
-    parallel.join_hosts(FLAGS.coordinator, FLAGS.num_processes, FLAGS.process_id)
-    preset = FLAGS.preset or ("cpu" if jax.default_backend() == "cpu" else "fast")
+    values(own)
+    parallel.join_hosts(values.coordinator, values.num_processes, values.process_id)
+    preset = values.preset or ("cpu" if jax.default_backend() == "cpu" else "fast")
     try:
-        if FLAGS.data is None:
-            config = presets.make_config(FLAGS.env, FLAGS.method, preset, FLAGS.seed)
+        if values.data is None:
+            config = presets.make_config(values.env, values.method, preset, values.seed)
         else:
-            config = recording.make_config(FLAGS.data, FLAGS.method, preset, FLAGS.seed)
+            config = recording.make_config(values.data, values.method, preset, values.seed)
     except ValueError as error:
         raise flags.Error(str(error)) from error
     _check_fields(argv, config)
@@ -89,8 +95,8 @@ def _parse(argv: Sequence[str]) -> list[str]:
         except ValueError as error:
             raise flags.Error(str(error)) from error
     rest = [arg for arg in argv if arg not in unset]
-    config_flags.DEFINE_config_dataclass("config", config, "Every hyperparameter.", sys_argv=rest)
-    return FLAGS(rest)
+    config_flags.DEFINE_config_dataclass("config", config, "Every hyperparameter.", values, sys_argv=rest)
+    return values(rest)
 
 
 def _check_fields(argv: Sequence[str], config: Config) -> None:

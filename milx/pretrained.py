@@ -10,6 +10,7 @@ import numpy as np
 
 from milx import config as config_lib
 from milx import envs, methods, policy
+from milx.data import demos as demos_lib
 from milx.policy import Policy, params_like, spec_of
 
 FOLDER = pathlib.Path(__file__).parent / "pretrained"
@@ -21,7 +22,7 @@ def names() -> list[str]:
 
 
 def result(name: str) -> dict[str, Any]:
-    """What one of them reached: the evaluation.json of its run."""
+    """What one of them reached: the evaluation.json of its run, and a hash of the parameters (`demos.fingerprint`)."""
     return json.loads((FOLDER / name / "result.json").read_text())
 
 
@@ -42,10 +43,10 @@ def load(run: str | pathlib.Path) -> Policy:
     config = config_lib.from_dict(result(str(run))["config"])
     spec = spec_of(envs.make(config.env_name, config.env.image_shape))
     method = methods.make(config, spec)
-    paths, structure = jax.tree_util.tree_flatten_with_path(params_like(method, spec))
+    like = params_like(method, spec)
     with np.load(FOLDER / run / "params.npz", allow_pickle=False) as arrays:
-        leaves = [jnp.asarray(arrays[jax.tree_util.keystr(path, simple=True, separator=".")]) for path, _ in paths]
-    return Policy(method, spec, jax.tree.unflatten(structure, leaves), config)
+        leaves = [jnp.asarray(arrays[name]) for name in demos_lib.leaves(like)]
+    return Policy(method, spec, jax.tree.unflatten(jax.tree.structure(like), leaves), config)
 
 
 def save(trained: Policy, reached: dict[str, Any], folder: pathlib.Path) -> None:
@@ -57,9 +58,7 @@ def save(trained: Policy, reached: dict[str, Any], folder: pathlib.Path) -> None
         folder: where to.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    paths, _ = jax.tree_util.tree_flatten_with_path(trained.params)
-    arrays: dict[str, Any] = {
-        jax.tree_util.keystr(path, simple=True, separator="."): np.asarray(leaf) for path, leaf in paths
-    }
+    arrays: dict[str, Any] = {name: np.asarray(leaf) for name, leaf in demos_lib.leaves(trained.params).items()}
     np.savez_compressed(folder / "params.npz", **arrays)
-    (folder / "result.json").write_text(json.dumps(reached, indent=1) + "\n")
+    digest = demos_lib.fingerprint(trained.params)
+    (folder / "result.json").write_text(json.dumps(reached | {"params_hash": digest}, indent=1) + "\n")

@@ -1,6 +1,6 @@
 """Whatever comes in: it works, or a ValueError names the field, what came and what was expected.
 
-Cases are drawn by Hypothesis; CASES says how many of each kind, 2,300 together.
+Cases are drawn by Hypothesis; CASES says how many of each kind, 2,800 together.
 """
 
 import dataclasses
@@ -12,12 +12,15 @@ import shutil
 import h5py
 import hypothesis.extra.numpy as arrays
 import numpy as np
+import pyarrow
+import pyarrow.parquet
 import pytest
+from absl import flags
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from milx import config as config_lib
-from milx import recording
+from milx import launch, recording, validate
 from milx.config import GIVEN
 from milx.data import lerobot
 from milx.data.dataset import DataSet, Writer
@@ -28,7 +31,16 @@ from milx.policy import check_demo, check_observation
 from milx.presets import PRESETS, make_config
 from milx.types import Demo, Observation
 
-CASES = {"demos": 700, "observations": 300, "configs": 500, "headers": 400, "lerobot": 250, "robomimic": 150}
+CASES = {
+    "demos": 700,
+    "observations": 300,
+    "configs": 500,
+    "flags": 300,
+    "headers": 400,
+    "lerobot": 250,
+    "parquet": 200,
+    "robomimic": 150,
+}
 FIXTURES = pathlib.Path(__file__).parent / "fixtures"
 SPEC = Spec((4, 5), 3, 2, ((-1.0, -2.0), (1.0, 2.0)), ())
 """Without goals, which JAX would compile for every length."""
@@ -40,13 +52,17 @@ def cases(name):
 
 
 def accepted(function):
-    """What it returns, or None where a ValueError says why not, in the way that all errors do."""
+    """What it returns, or None where an error says why not, in the way that all do."""
     try:
         return function()
-    except ValueError as error:
+    except (ValueError, flags.Error) as error:
         text = str(error)
-        assert re.search(r"^[\w./ '\[\]:()-]+: ", text) or " has no " in text or "expected" in text, text
-        assert len(text) < 2000
+        if isinstance(error, (flags.UnrecognizedFlagError, flags.IllegalFlagValueError)):  # in absl's words
+            assert re.search(r"flag '?[\w.-]+", text), text
+        else:
+            assert re.search(r"^[\w./ '\[\]:()-]+: ", text), text
+            assert "expected" in text or "no such" in text, text
+        assert len(text) < 5000
         return None
 
 
@@ -112,6 +128,30 @@ def test_configs(data):
         for field, value in config_lib.flatten(config_lib.to_dict(config)).items():
             if isinstance(value, float):
                 assert np.isfinite(value), field
+
+
+@cases("flags")
+@given(data=st.data())
+def test_flags(data):
+    """Flags and overrides with any text: a configuration that training would take, or an error that names the flag."""
+    fields = config_lib.flatten(config_lib.to_dict(make_config("reach", preset="cpu")))
+    names = ["env", "method", "preset", "seed", "data", "nope", *(f"config.{name}" for name in (*fields, "nope"))]
+    literal = JSON.map(repr)
+    text = st.one_of(
+        literal, st.text(max_size=5), st.sampled_from([*PRESETS, "cpu", "paper", "3", "0.5", "(2, 2)", "None"])
+    )
+    drawn = data.draw(st.lists(st.tuples(st.sampled_from(names), text), max_size=3))
+
+    def parse():
+        values = flags.FlagValues()
+        launch.define_flags(values)
+        launch.parse(["train", "--preset=cpu", *(f"--{name}={value}" for name, value in drawn)], values)
+        validate.check(values.config)
+        return values.config
+
+    config = accepted(parse)
+    if config is not None:
+        assert config_lib.from_dict(config_lib.to_dict(config)) == config
 
 
 @pytest.fixture(scope="module")
@@ -181,6 +221,46 @@ def test_metadata_of_lerobot(data, tmp_path_factory):
     demos = accepted(read)
     if demos is not None:
         assert [len(demo.state) for demo in demos] == [12, 9]
+    shutil.rmtree(root)
+
+
+CELLS = st.one_of(
+    st.none(),
+    st.integers(-2, 3),
+    st.integers(-(2**62), 2**62),
+    st.floats(),
+    st.text(max_size=3),
+    st.lists(st.floats(width=32), max_size=4),
+    st.lists(st.text(max_size=3), max_size=2),
+)
+
+
+@cases("parquet")
+@given(data=st.data())
+def test_tables_of_lerobot(data, tmp_path_factory):
+    """A column of any type, or without some of its values."""
+    root = pathlib.Path(shutil.copytree(FIXTURES / "lerobot", tmp_path_factory.mktemp("bad") / "set"))
+    path = data.draw(st.sampled_from(sorted(path.relative_to(root) for path in root.rglob("*.parquet"))))
+    table = pyarrow.parquet.read_table(root / path)
+    name = data.draw(st.sampled_from(table.column_names))
+    if data.draw(st.booleans()):
+        column = [data.draw(CELLS)] * len(table)
+    else:
+        lost = data.draw(st.integers(0, len(table) - 1))
+        column = [None if i == lost else value for i, value in enumerate(table[name].to_pylist())]
+    changed = table.set_column(table.column_names.index(name), name, pyarrow.array(column))
+    pyarrow.parquet.write_table(changed, root / path)
+    lerobot._read_table.cache_clear()
+
+    def read():
+        source = LeRobot(root, "observation.images.top", "observation.state", "action", 128)
+        return [episode.read() for episode in source.episodes("task_index")[:2]]
+
+    demos = accepted(read)
+    if demos is not None:
+        for demo in demos:
+            assert len(demo.image) == len(demo.state) == len(demo.action)
+            assert demo.state.dtype.kind == "f"
     shutil.rmtree(root)
 
 

@@ -219,7 +219,7 @@ class DataSet:
             try:
                 array = ts.open({"driver": "zarr3", "kvstore": _kvstore(path)}, open=True, read=True).result()
             except ValueError as error:
-                raise ValueError(f"{path}: cannot be opened: {error}") from error
+                raise ValueError(f"{path}: cannot be opened, expected an array of zarr: {error}") from error
             if array.shape != expected or array.dtype.numpy_dtype != dtype:
                 got = f"{array.dtype.name} {list(array.shape)}"
                 raise ValueError(f"{path}: got {got}, expected {np.dtype(dtype).name} {list(expected)}")
@@ -288,14 +288,15 @@ def _read_header(folder: pathlib.Path) -> Header:
             raise ValueError(f"version: got {version!r}, expected {VERSION}")
         return _parse_header(values)
     except (KeyError, TypeError, AttributeError, ValueError) as error:
-        raise ValueError(f"{path}: no header of a milx data set: {error}") from error
+        raise ValueError(f"{path}: expected the header of a milx data set: {error}") from error
 
 
 def _parse_header(values: dict[str, Any]) -> Header:
     shape = values["image_shape"]
     sizes = [values["state_size"], values["action_size"], *(shape or ())]
     if not all(isinstance(size, int) and 0 <= size < 1 << 20 for size in sizes) or (shape and len(shape) != 2):
-        raise ValueError(f"sizes: got image_shape {shape}, state_size {sizes[0]} and action_size {sizes[1]}")
+        got = f"image_shape {shape}, state_size {sizes[0]} and action_size {sizes[1]}"
+        raise ValueError(f"sizes: got {got}, expected whole numbers, two of them for images")
     tasks = []
     for i, task in enumerate(values["tasks"]):
         info = TaskInfo(task["name"], task["split"], tuple(task["lengths"]), tuple(task["has_action"]))

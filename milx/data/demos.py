@@ -232,16 +232,16 @@ def cached(
     return demos
 
 
-def leaves(demos: DemoSet) -> dict[str, Any]:
-    """All arrays by name, such as "states.qpos", in a fixed order."""
-    pairs, _ = jax.tree_util.tree_flatten_with_path(demos)
+def leaves(arrays: Any) -> dict[str, Any]:
+    """All arrays of a pytree by name, such as "states.qpos", in a fixed order."""
+    pairs, _ = jax.tree_util.tree_flatten_with_path(arrays)
     return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in pairs}
 
 
-def fingerprint(demos: DemoSet) -> str:
-    """SHA-256 over names, types, shapes and contents of all arrays."""
+def fingerprint(arrays: Any) -> str:
+    """Of a pytree: SHA-256 over names, types, shapes and contents of all arrays."""
     digest = hashlib.sha256()
-    for name, leaf in leaves(demos).items():
+    for name, leaf in leaves(arrays).items():
         array = np.ascontiguousarray(leaf)
         digest.update(f"{name} {array.dtype} {array.shape} ".encode())
         digest.update(array.tobytes())

@@ -129,7 +129,7 @@ def read_mapping(path: str | pathlib.Path) -> dict[str, str]:
     try:
         mapping = json.loads(pathlib.Path(path).read_text())
     except (OSError, ValueError) as error:
-        raise ValueError(f"task: {path} is no JSON file: {error}") from error
+        raise ValueError(f"task: expected a JSON file at {path}: {error}") from error
     if not isinstance(mapping, dict) or not all(isinstance(task, str) for task in mapping.values()):
         raise ValueError(f"task: {path}: expected a JSON object from names of episodes to names of tasks")
     return mapping
@@ -142,7 +142,9 @@ def lookup(mapping: dict[str, str], name: str, path: str) -> str:
         ValueError: if the mapping does not say.
     """
     if name not in mapping:
-        raise ValueError(f"task: {path} does not say to which task episode {name!r} belongs")
+        raise ValueError(
+            f"task: {path} does not say to which task episode {name!r} belongs, expected all episodes in it"
+        )
     return mapping[name]
 
 
@@ -156,11 +158,11 @@ def inside(root: pathlib.Path, path: str | pathlib.Path) -> pathlib.Path:
         found = (root / path).resolve()
         there = found.is_file()
     except (OSError, RuntimeError, ValueError) as error:  # names that are too long, links that lead to themselves
-        raise ValueError(f"{root}: {str(path)[:200]} is no path: {error!r:.200}") from error
+        raise ValueError(f"{root}: expected a path, got {str(path)[:200]}: {error!r:.200}") from error
     if not found.is_relative_to(root.resolve()):
-        raise ValueError(f"{root}: {path} leads out of the data set's folder")
+        raise ValueError(f"{root}: {path} leads out of the data set's folder, expected a path inside")
     if not there:
-        raise ValueError(f"{root}: {path} is missing")
+        raise ValueError(f"{root}: {path} is missing, expected a file")
     return found
 
 

@@ -117,7 +117,7 @@ class LeRobot:
         for path in sorted((self.root / "meta" / "episodes").glob("*/*.parquet")):
             rows += _read_table(shared.inside(self.root, path.relative_to(self.root)), tuple(columns)).to_pylist()
         if not rows:
-            raise ValueError(f"{self.root}: meta/episodes holds no episodes")
+            raise ValueError(f"{self.root}: meta/episodes is empty, expected episodes")
         for row in rows:
             self._check_row(row)
         return sorted(rows, key=lambda row: row["episode_index"])
@@ -152,13 +152,13 @@ class LeRobot:
             version = str(info["codebase_version"])
             features, fps = info["features"], info["fps"]
         except (KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"{path}: not LeRobot's metadata: {error!r}") from error
+            raise ValueError(f"{path}: expected LeRobot's metadata: {error!r}") from error
         if version.startswith("v2"):
             raise ValueError(f"{path}: codebase_version: got {version}, expected v3.0; convert it with `{_CONVERTER}`")
         if not version.startswith("v3"):
             raise ValueError(f"{path}: codebase_version: got {version}, expected v3.0")
         if not isinstance(features, dict) or not isinstance(fps, int | float) or not 0 < fps < 10_000:
-            raise ValueError(f"{path}: features or fps: not as in LeRobot's metadata")
+            raise ValueError(f"{path}: features or fps: expected what LeRobot writes")
         for name, feature in features.items():
             there = isinstance(feature, dict) and isinstance(feature.get("dtype"), str)
             if not there or not isinstance(feature.get("shape"), list):
@@ -214,8 +214,8 @@ def read_video(file: pathlib.Path, start: float, count: int, fps: float) -> Iter
                 if wanted == count:
                     return
     except (av.FFmpegError, IndexError) as error:
-        raise ValueError(f"{file}: no video that can be read: {error}") from error
-    raise ValueError(f"{file}: has no frame at {start + wanted / fps:.3f} s")
+        raise ValueError(f"{file}: expected a video that can be read: {error}") from error
+    raise ValueError(f"{file}: expected a frame at {start + wanted / fps:.3f} s, there is none")
 
 
 def _images(file: pathlib.Path, values: list[Any]) -> Iterator[np.ndarray]:
@@ -223,7 +223,7 @@ def _images(file: pathlib.Path, values: list[Any]) -> Iterator[np.ndarray]:
         try:
             yield np.asarray(Image.open(io.BytesIO(value["bytes"])).convert("RGB"))
         except (OSError, TypeError, KeyError, Image.DecompressionBombError) as error:
-            raise ValueError(f"{file}: an image that cannot be read: {error}") from error
+            raise ValueError(f"{file}: expected an image that can be read: {error}") from error
 
 
 def _fill(template: Any, values: dict[str, Any]) -> str:
@@ -240,7 +240,7 @@ def _fill(template: Any, values: dict[str, Any]) -> str:
 
 @functools.lru_cache(maxsize=4)
 def _read_table(file: pathlib.Path, columns: tuple[str, ...]) -> Any:
-    """Some columns of a parquet file, unless they are missing or too large."""
+    """Some columns of a parquet file, of which one is "episode_index", unless they are missing or too large."""
     try:
         import pyarrow
         import pyarrow.parquet
@@ -249,14 +249,17 @@ def _read_table(file: pathlib.Path, columns: tuple[str, ...]) -> Any:
     try:
         metadata = pyarrow.parquet.read_metadata(file)
         if missing := sorted(set(columns) - set(metadata.schema.to_arrow_schema().names)):
-            raise ValueError(f"{file}: has no column {missing[0]!r}")
+            raise ValueError(f"{file}: has no column {missing[0]!r}, expected {', '.join(columns)}")
         groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
         parts = [group.column(i) for group in groups for i in range(group.num_columns)]
         wanted = [part for part in parts if part.path_in_schema.startswith(columns)]
         check_size(str(file), (sum(max(part.total_uncompressed_size, 8 * part.num_values) for part in wanted),), 1)
-        return pyarrow.parquet.read_table(file, columns=list(columns))
+        table = pyarrow.parquet.read_table(file, columns=list(columns))
+        if not pyarrow.types.is_integer(numbers := table["episode_index"].type):
+            raise ValueError(f"{file}: episode_index: got {numbers}, expected whole numbers")
+        return table
     except (pyarrow.ArrowException, OSError) as error:
-        raise ValueError(f"{file}: no parquet file that can be read: {error}") from error
+        raise ValueError(f"{file}: expected a parquet file that can be read: {error}") from error
 
 
 def main(argv: list[str]) -> None:

@@ -112,14 +112,14 @@ def _open(path: pathlib.Path) -> Any:
     try:
         return h5py.File(path, "r")
     except OSError as error:
-        raise ValueError(f"{path}: no HDF5 file that can be read: {error}") from error
+        raise ValueError(f"{path}: expected an HDF5 file that can be read: {error}") from error
 
 
 def _demos(file: Any) -> list[str]:
     """The names of the demonstrations, demo_2 before demo_10."""
     names = _members(file, "data")
     if not names:
-        raise ValueError(f"{file.filename}: has no demonstrations under data/")
+        raise ValueError(f"{file.filename}: expected demonstrations under data/, there are none")
     number = lambda name: int((re.findall(r"\d+", name) or ["0"])[-1])  # noqa: E731
     return sorted(names, key=lambda name: (number(name), name))
 
@@ -132,9 +132,9 @@ def _dataset(file: Any, name: str, axes: int) -> Any:
     where, found = f"{file.filename}: {name}", file.get(name)
     if not isinstance(found, h5py.Dataset):
         there = ", ".join(_members(file, name.rpartition("/")[0])) or "nothing"
-        raise ValueError(f"{where}: missing, there is {there}")
+        raise ValueError(f"{where}: missing, expected it beside {there}")
     if found.is_virtual or found.external:
-        raise ValueError(f"{where}: is stored outside the file, which is not read")
+        raise ValueError(f"{where}: is stored outside the file, expected inside: nothing else is read")
     if found.ndim != axes or found.dtype.kind not in "fiu":
         raise ValueError(f"{where}: got {found.dtype} {list(found.shape)}, expected numbers with {axes} axes")
     check_size(where, found.shape, found.dtype.itemsize)
@@ -158,7 +158,9 @@ def _check_links(file: Any, name: str) -> None:
     for part in name.split("/"):
         link = at.get(part, getlink=True) if isinstance(at, h5py.Group) else None
         if isinstance(link, h5py.ExternalLink | h5py.SoftLink):
-            raise ValueError(f"{file.filename}: {name}: {part} leads out of its group by a link, which is not followed")
+            raise ValueError(
+                f"{file.filename}: {name}: {part} is a link out of its group, expected none: it is not followed"
+            )
         at = None if link is None else at.get(part)
 
 

@@ -157,20 +157,20 @@ def test_a_linked_episodes_folder_is_not_followed(copy):
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (lambda root: (root / "meta/info.json").write_text("{"), "not LeRobot's metadata"),
+        (lambda root: (root / "meta/info.json").write_text("{"), "expected LeRobot's metadata"),
         (lambda root: (root / "meta/info.json").unlink(), "has no meta/info.json, expected a LeRobot data set"),
-        (lambda root: shutil.rmtree(root / "meta/episodes"), "meta/episodes holds no episodes"),
-        (lambda root: change_info(root, fps=0), "features or fps: not as in"),
+        (lambda root: shutil.rmtree(root / "meta/episodes"), "meta/episodes is empty, expected episodes"),
+        (lambda root: change_info(root, fps=0), "features or fps: expected what LeRobot writes"),
         (
             lambda root: (root / "data/chunk-000/file-000.parquet").write_bytes(b"PAR1"),
-            "no parquet file that can be read",
+            "expected a parquet file that can be read",
         ),
         (
             lambda root: (root / f"videos/{TOP}/chunk-000/file-000.mp4").write_bytes(b"x" * 99),
-            "no video that can be read",
+            "expected a video that can be read",
         ),
         (lambda root: (root / f"videos/{TOP}/chunk-000/file-000.mp4").unlink(), "file-000.mp4 is missing"),
-        (lambda root: change_episodes(root, f"videos/{TOP}/from_timestamp", 60.0), "has no frame at 60.000 s"),
+        (lambda root: change_episodes(root, f"videos/{TOP}/from_timestamp", 60.0), "expected a frame at 60.000 s"),
         (lambda root: change_episodes(root, "length", 10**6), "got 12 rows of episode 0, expected 1000000"),
         (
             lambda root: change_episodes(root, "length", 0),

@@ -84,8 +84,8 @@ def enormous(path):
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (lambda path: path.write_bytes(b"HDF"), "no HDF5 file that can be read"),
-        (lambda path: replace(path, "data/demo_0/actions", None), "data/demo_0/actions: missing, there is"),
+        (lambda path: path.write_bytes(b"HDF"), "expected an HDF5 file that can be read"),
+        (lambda path: replace(path, "data/demo_0/actions", None), "data/demo_0/actions: missing, expected it beside"),
         (
             lambda path: replace(path, "data/demo_0/actions", np.zeros((7, 2, 2))),
             r"got float64 \[7, 2, 2\], expected numbers",
@@ -94,13 +94,13 @@ def enormous(path):
         (lambda path: replace(path, "data/demo_0/obs/agentview_image", np.zeros((7, 20, 30, 3))), "expected uint8"),
         (
             lambda path: replace(path, "data", h5py.ExternalLink("/etc/passwd", "/")),
-            "data: data leads out of its group",
+            "data: data is a link out of its group",
         ),
         (
             lambda path: replace(path, "data/demo_0/actions", h5py.ExternalLink("../x.hdf5", "/a")),
-            "actions leads out of its group",
+            "actions is a link out of its group",
         ),
-        (lambda path: replace(path, "data/demo_0/obs", h5py.SoftLink("/hidden")), "obs leads out of its group"),
+        (lambda path: replace(path, "data/demo_0/obs", h5py.SoftLink("/hidden")), "obs is a link out of its group"),
         (virtual, "is stored outside the file"),
         (external, "is stored outside the file"),
         (enormous, r"got shape \[1000000000, 4\], 29.8 GiB, expected at most 8"),
@@ -114,7 +114,7 @@ def test_damaged_and_hostile_files_are_refused(copy, damage, message):
 
 def test_observations_that_do_not_exist_are_named(copy, tmp_path):
     with pytest.raises(
-        ValueError, match="obs/wrist: missing, there is agentview_image, robot0_eef_pos, robot0_gripper"
+        ValueError, match="obs/wrist: missing, expected it beside agentview_image, robot0_eef_pos, robot0_gripper"
     ):
         open_set(copy, state="wrist")
     with pytest.raises(ValueError, match=r"expected a file in robomimic's layout, or a folder of \*.hdf5 files"):
