@@ -15,6 +15,9 @@ from milx.config import Config
 from milx.data.demos import DemoSet
 from milx.simulation import SimulatedRun
 
+# Compiling takes longer than running here.
+os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=1"
+
 
 @dataclasses.dataclass(frozen=True)
 class Trained:
