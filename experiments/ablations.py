@@ -44,7 +44,7 @@ def main(_: list[str]) -> None:
     folder = options.folder("ablations")
     runner = cells.Cells(folder, configure({}, seed=0).data.tasks)
     for seed in range(options.SEEDS.value):
-        for name in _CHANGED.value:
+        for name in () if options.SHOW.value else _CHANGED.value:
             runner.run({f"{name.replace(' ', '-')}-{seed}": configure(ABLATIONS[name], seed)})
     results = cells.read(folder)
     print("| changed | " + " | ".join(f"seed {seed}" for seed in range(options.SEEDS.value)) + " | training |")

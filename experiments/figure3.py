@@ -117,7 +117,8 @@ def draw(results: list[dict[str, Any]], path: pathlib.Path) -> None:
 
 def main(_: list[str]) -> None:
     """Runs and draws."""
-    run_cells()
+    if not options.SHOW.value:
+        run_cells()
     folder = options.folder("figure3")
     results = list(cells.read(folder).values())
     print_table(results)

@@ -49,7 +49,7 @@ def configure(env: str, row: Row, shots: int, seed: int) -> Config:
 
 
 def make(table: Table) -> None:
-    """Runs what is missing and prints a table for every criterion.
+    """Runs what is missing, unless told only to show what there is, and prints a table for every criterion.
 
     Raises:
         ValueError: for a row that the table does not have; the message lists those that it has.
@@ -60,13 +60,16 @@ def make(table: Table) -> None:
     folder, runners = options.folder(table.folder), {}
     seeds = range(options.SEEDS.value)
     for seed in seeds:
-        for name, row in rows.items():
+        for name, row in {} if options.SHOW.value else rows.items():
             of_shots = {f"{name}-{shots}-{seed}": configure(table.env, row, shots, seed) for shots in table.shots}
             tasks = configure(table.env, row, 1, seed).data.tasks
             runners.setdefault(tasks, cells.Cells(folder, tasks)).run(of_shots)
     found = cells.read(folder)
-    runs = {name: [[found[f"{name}-{shots}-{seed}"] for seed in seeds] for shots in table.shots] for name in rows}
-    print(markdown(runs, table.shots))
+    print(markdown({name: [_of_seeds(found, f"{name}-{k}") for k in table.shots] for name in rows}, table.shots))
+
+
+def _of_seeds(found: dict[str, dict[str, Any]], name: str) -> list[dict[str, Any]]:
+    return [found[cell] for seed in range(options.SEEDS.value) if (cell := f"{name}-{seed}") in found]
 
 
 def markdown(runs: dict[str, list[list[dict[str, Any]]]], shots: tuple[int, ...]) -> str:
@@ -76,20 +79,22 @@ def markdown(runs: dict[str, list[list[dict[str, Any]]]], shots: tuple[int, ...]
         runs: result files of every row, by column and seed.
         shots: the columns.
     """
-    first = next(iter(runs.values()))[0][0]
-    lines = []
+    complete = [columns for columns in runs.values() if all(columns)]
+    if not complete:
+        return "No row is complete."
+    longest = max(complete, key=lambda columns: len(columns[0]))
+    first, lines = longest[0][0], []
     for criterion in (first["criterion"], *first.get("other_criteria", ())):
         lines += [f"| {criterion} | " + " | ".join(f"{k}-shot" for k in shots) + " |", "|---|" + "---|" * len(shots)]
         for name, columns in runs.items():
             shown = [interval([judged(run, criterion) for run in seeds]) for seeds in columns]
             lines.append(f"| {name} | {' | '.join(shown)} |")
-        floors = [[judged(run, criterion)["baselines"] for run in seeds] for seeds in next(iter(runs.values()))]
+        floors = [[judged(run, criterion)["baselines"] for run in seeds] for seeds in longest]
         for name in ("random", "task_blind", "expert"):
             shown = [f"{statistics.mean(run[name] for run in seeds):.1%}" for seeds in floors]
             lines.append(f"| *{name.replace('_', '-')}* | {' | '.join(shown)} |")
         lines.append("")
-    trials = sum(run["trials"] for run in next(iter(runs.values()))[0])
-    return "\n".join([*lines, f"{trials} trials in a field, of {len(next(iter(runs.values()))[0])} seeds."])
+    return "\n".join([*lines, f"{first['trials']} trials for each seed; in brackets their intervals and their number."])
 
 
 def judged(run: dict[str, Any], criterion: str) -> dict[str, Any]:
@@ -98,6 +103,8 @@ def judged(run: dict[str, Any], criterion: str) -> dict[str, Any]:
 
 
 def interval(runs: list[dict[str, Any]]) -> str:
-    """The mean over runs, and from where to where their 95% intervals reach."""
+    """The mean over runs, from where to where their 95% intervals reach, and how many there are; "" for none."""
+    if not runs:
+        return ""
     low, high = min(run["wilson95"][0] for run in runs), max(run["wilson95"][1] for run in runs)
-    return f"{statistics.mean(run['success'] for run in runs):.1%} ({low:.1%} to {high:.1%})"
+    return f"{statistics.mean(run['success'] for run in runs):.1%} ({low:.1%} to {high:.1%}; {len(runs)})"

@@ -120,6 +120,8 @@ def _check_given(config: Config, spec: Spec) -> None:
         raise ValueError(f"mil.given: got {given!r}, expected one of {', '.join(GIVEN)}")
     if given == "video" and spec.image_shape is None:
         raise ValueError("mil.given: got 'video', expected the state, too: this policy sees no pixels")
+    if config.network.robot_head and not (config.network.goal_head and spec.goal_indices and spec.image_shape):
+        raise ValueError("network.robot_head: got True, expected False: it needs a goal head that sees pixels")
     if learned not in (None, *KINDS):
         raise ValueError(f"network.learned_loss: got {learned!r}, expected None or one of {', '.join(KINDS)}")
     if config.method_name == "mil" and (learned is None) != (given == GIVEN[0]):

@@ -32,7 +32,7 @@ def behavioural_cloning(
     whitening: Whitening,
     goal_indices: tuple[int, ...],
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """The mean squared error of the actions (eq. 2), plus the goal head's error where there is one.
+    """The mean squared error of the actions (eq. 2), plus the errors of the goal head and the robot head if there are.
 
     Args:
         config: scale and weight of the losses.
@@ -52,6 +52,10 @@ def behavioural_cloning(
     if output.goal is not None and demo.goal is not None:
         metrics["goal_loss"] = goal_loss(output.goal, demo.goal, whitening, goal_indices)
         loss += config.goal_weight * metrics["goal_loss"]
+    if output.robot is not None:
+        where = whitening.state(demo.state.reshape(-1, demo.state.shape[-1]))[:, jnp.array(goal_indices)]
+        metrics["robot_loss"] = jnp.mean(jnp.square(output.robot - where))
+        loss += metrics["robot_loss"]
     return loss, metrics
 
 

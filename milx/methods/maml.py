@@ -18,7 +18,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from milx.config import MILConfig
+from milx.config import GIVEN, MILConfig
 from milx.methods.base import Method
 from milx.methods.imitation import behavioural_cloning, calibrate_goal_head, goal_loss, shown
 from milx.networks.policy import PolicyNetwork, PolicyOutput
@@ -84,6 +84,7 @@ class MIL(Method):
     def adapt(self, params: Params, demo: Demo) -> Params:
         """Takes the inner gradient steps (eq. 1) on demonstrations [K, T, ...]: their gradients are averaged."""
         theta, demo = params["policy"], shown(demo, self.config.given, params["whitening"])
+        demo = self._with_seen_goal(params, demo)
         rates = jax.tree.map(lambda _: self.config.inner_lr, theta)
         if self.config.learn_inner_lr:
             rates = jax.tree.map(lambda s: self.config.inner_lr * jnp.exp(s), params["inner_log_lr"])
@@ -123,6 +124,21 @@ class MIL(Method):
         if output.goal is not None and demo.goal is not None:
             loss += self.config.goal_weight * goal_loss(output.goal, demo.goal, whitening, self.goal_indices)
         return loss
+
+    def _with_seen_goal(self, params: Params, demo: Demo) -> Demo:
+        """Video alone gets a goal for its last image, as if given: where the robot head sees the robot in it.
+
+        In earlier ones a thing that the robot moves may be elsewhere.
+        """
+        if self.config.given != GIVEN[2]:
+            return demo
+        whitening, indices = params["whitening"], jnp.array(self.goal_indices, int)
+        end = self._apply(params["policy"], whitening, jax.tree.map(lambda x: x[:, -1:], demo)).robot
+        if end is None:
+            return demo
+        end = whitening.state_mean[indices] + whitening.state_scale[indices] * end
+        unknown = jnp.full((*demo.state.shape[:2], len(indices)), jnp.nan)
+        return dataclasses.replace(demo, goal=unknown.at[:, -1].set(jax.lax.stop_gradient(end)))
 
     def _apply(self, theta: Params, whitening: Whitening, demo: Demo) -> PolicyOutput:
         """What the network says of all time steps of demonstrations [K, T, ...], one after the other."""

@@ -16,7 +16,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from milx.networks.layers import positions
+from milx.networks.layers import Dense, positions
 from milx.types import Params
 
 
@@ -94,6 +94,22 @@ class StateGoalHead(nn.Module):
             heat += query
         vote = nn.DenseGeneral((self.candidates, self.size), param_dtype=state.dtype, name="vote")(state)
         return Goal(jax.nn.log_softmax(heat), vote, self.param("log_std", nn.initializers.zeros, ()))
+
+
+class RobotHead(nn.Module):
+    """Maps what the convolutions see, [B, F], to where the robot is, [B, G] in whitened units.
+
+    Attributes:
+        size: G.
+    """
+
+    size: int
+    hidden: ClassVar[int] = 64
+
+    @nn.compact
+    def __call__(self, seen: jax.Array) -> jax.Array:
+        """See the class."""
+        return Dense(self.size)(Dense(self.hidden, hidden=True)(seen))
 
 
 def calibrate(params: Params, image_to_goal: jax.Array) -> Params:

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from milx.config import NetworkConfig
-from milx.networks.goal import Goal, GoalHead, StateGoalHead
+from milx.networks.goal import Goal, GoalHead, RobotHead, StateGoalHead
 from milx.networks.layers import ConvBlock, Dense, FixedConv, SpatialSoftArgmax
 from milx.networks.learned_loss import LearnedLoss
 from milx.types import Params
@@ -21,12 +21,14 @@ class PolicyOutput(NamedTuple):
         action: [B, A] of the head that acts, in the network's units.
         inner_action: [B, A] of the head that the inner loss sees; the same head if there is only one.
         goal: where the episode will end; None without a goal head.
+        robot: [B, G] whitened, where the robot is, as far as the image tells; None without a robot head.
         features: [B, F] what the last layer sees.
     """
 
     action: jax.Array
     inner_action: jax.Array
     goal: Goal | None
+    robot: jax.Array | None
     features: jax.Array
 
 
@@ -86,11 +88,13 @@ class Controller(nn.Module):
             context: [B, D], joins the input of the first fully connected layer.
             query: [B, C] or, without features, [B, candidates]: tells the goal head what to look for; None for nothing.
         """
-        config, goal = self.config, None
+        config, goal, robot = self.config, None, None
         parts, has_goal = [state, context], config.goal_head and self.goal_size
         if features is not None:
             seen = SpatialSoftArgmax()(features) if config.soft_argmax else features.reshape(len(features), -1)
             parts = [seen, *parts]
+            if config.robot_head:
+                robot = RobotHead(self.goal_size, name="robot_head")(seen)
         if has_goal:
             head, on = (StateGoalHead, state) if features is None else (GoalHead, features)
             goal = head(self.goal_size, name="goal_head")(on, query)
@@ -99,7 +103,7 @@ class Controller(nn.Module):
         for size in config.fc_layers:
             x = Dense(size, hidden=True, norm=config.fc_norm, init_std=config.fc_init_std)(x)
         heads = [Dense(self.action_size, init_std=config.fc_init_std)(x) for _ in range(config.heads)]
-        return PolicyOutput(action=heads[-1], inner_action=heads[0], goal=goal, features=x)
+        return PolicyOutput(action=heads[-1], inner_action=heads[0], goal=goal, robot=robot, features=x)
 
 
 class _Policy(nn.Module):

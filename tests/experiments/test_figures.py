@@ -54,14 +54,15 @@ def test_a_table_shows_means_intervals_floors_and_every_criterion():
         mine = {"success": success, "wilson95": [low, high], "baselines": floors, "trials": 50}
         return mine | {"criterion": "on it", "other_criteria": {"near it": other}}
 
-    text = tables.markdown({"one": [[run(0.5, 0.4, 0.6, 0.7), run(0.7, 0.65, 0.75, 0.8)]]}, (1,))
+    text = tables.markdown({"one": [[run(0.5, 0.4, 0.6, 0.7), run(0.7, 0.65, 0.75, 0.8)]], "two": [[]]}, (1,))
     lines = text.splitlines()
     assert lines[0] == "| on it | 1-shot |"
-    assert lines[2] == "| one | 60.0% (40.0% to 75.0%) |"
-    assert lines[3:6] == ["| *random* | 10.0% |", "| *task-blind* | 25.0% |", "| *expert* | 90.0% |"]
-    assert lines[7] == "| near it | 1-shot |"
-    assert lines[9:11] == ["| one | 75.0% (60.0% to 90.0%) |", "| *random* | 30.0% |"]
-    assert lines[-1] == "100 trials in a field, of 2 seeds."
+    assert lines[2] == "| one | 60.0% (40.0% to 75.0%; 2) |"
+    assert lines[3:7] == ["| two |  |", "| *random* | 10.0% |", "| *task-blind* | 25.0% |", "| *expert* | 90.0% |"]
+    assert lines[8] == "| near it | 1-shot |"
+    assert lines[10:12] == ["| one | 75.0% (60.0% to 90.0%; 2) |", "| two |  |"]
+    assert lines[12] == "| *random* | 30.0% |"
+    assert lines[-1].startswith("50 trials for each seed")
 
 
 @pytest.fixture

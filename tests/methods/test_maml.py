@@ -165,7 +165,7 @@ def test_no_gradient_reaches_the_whitening_and_adam_leaves_it(batch):
 CONSTANT = PolicyNetwork(
     init=lambda key: jnp.zeros(ACTION),
     apply=lambda theta, image, state: PolicyOutput(
-        *[jnp.broadcast_to(theta, (len(state), ACTION))] * 2, goal=None, features=state
+        *[jnp.broadcast_to(theta, (len(state), ACTION))] * 2, goal=None, robot=None, features=state
     ),
 )
 THETA = np.array([0.4, -1.3])
@@ -232,6 +232,29 @@ def test_closed_form_of_the_clipped_step(constant_case):
     gradient = jax.grad(lambda params: method.loss(params, batch)[0])(params)
     expected = np.where(held, 1, 1 - ALPHA * SLOPE) * SLOPE * (adapted - b)
     np.testing.assert_allclose(gradient["policy"], expected.mean(axis=0), rtol=1e-11)
+
+
+def test_a_video_teaches_the_goal_where_the_robot_head_sees_the_robot_at_its_end(batch):
+    """One vote, theta, of deviation one: the inner gradient is the vote minus the place, whatever the states are."""
+    place = jnp.array([0.2, 0.9])
+    network = PolicyNetwork(
+        init=CONSTANT.init,
+        apply=lambda theta, image, state: CONSTANT.apply(theta, image, state)._replace(
+            goal=Goal(jnp.zeros((len(state), 1)), theta[None], jnp.zeros(())),
+            robot=jnp.broadcast_to(place, (len(state), 2)),
+        ),
+        learned_loss=lambda theta, features: jnp.zeros(len(features)),
+    )
+    config = MILConfig(inner_lr=ALPHA, goal_weight=0.7, inner_clip=NO_CLIP, given="video")
+    method = MIL(config, network, GOAL_INDICES)
+    params = {"policy": jnp.asarray(THETA), "whitening": random_whitening(np.random.default_rng(4))}
+    support, query = (jax.tree.map(lambda x: x[0], demo) for demo in (batch.support, batch.query))
+    adapted = method.adapt(params, support)["policy"]
+    np.testing.assert_allclose(adapted, THETA - ALPHA * 0.7 * (THETA - place), rtol=1e-12)
+
+    _, metrics = method.imitation_loss(params["policy"], params["whitening"], query)
+    where = params["whitening"].state(np.asarray(query.state))[..., np.array(GOAL_INDICES)]
+    np.testing.assert_allclose(metrics["robot_loss"], np.mean((np.asarray(place) - where) ** 2), rtol=1e-12)
 
 
 def test_goal_head_learns_the_goal_of_each_time_step(batch):
