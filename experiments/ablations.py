@@ -46,13 +46,20 @@ def main(_: list[str]) -> None:
     for seed in range(options.SEEDS.value):
         for name in () if options.SHOW.value else _CHANGED.value:
             runner.run({f"{name.replace(' ', '-')}-{seed}": configure(ABLATIONS[name], seed)})
-    results = cells.read(folder)
-    print("| changed | " + " | ".join(f"seed {seed}" for seed in range(options.SEEDS.value)) + " | training |")
-    print("|---|" + "---|" * (options.SEEDS.value + 1))
-    for name in _CHANGED.value:
-        runs = [results[f"{name.replace(' ', '-')}-{seed}"] for seed in range(options.SEEDS.value)]
-        shown = [f"{run['success']:.1%} ({run['wilson95'][0]:.1%} to {run['wilson95'][1]:.1%})" for run in runs]
-        print(f"| {name} | {' | '.join(shown)} | {runs[0]['wall_clock_s']['train']:.0f} s |")
+    print(markdown(cells.read(folder), _CHANGED.value, options.SEEDS.value))
+
+
+def markdown(results: dict[str, dict[str, Any]], changed: list[str], seeds: int) -> str:
+    """A table of what there is: success on test tasks of every seed, and how long the first one's training took."""
+    lines = ["| changed | " + " | ".join(f"seed {seed}" for seed in range(seeds)) + " | training |"]
+    lines.append("|---|" + "---|" * (seeds + 1))
+    for name in changed:
+        runs = [results.get(f"{name.replace(' ', '-')}-{seed}") for seed in range(seeds)]
+        low_high = [run and "({:.1%} to {:.1%})".format(*run["wilson95"]) for run in runs]
+        shown = [f"{run['success']:.1%} {of}" if run else "" for run, of in zip(runs, low_high, strict=True)]
+        training = next((f"{run['wall_clock_s']['train']:.0f} s" for run in runs if run), "")
+        lines.append(f"| {name} | {' | '.join(shown)} | {training} |")
+    return "\n".join(lines)
 
 
 if __name__ == "__main__":

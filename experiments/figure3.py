@@ -73,11 +73,11 @@ def points(results: list[dict[str, Any]]) -> dict[tuple[str, str], dict[int, Poi
     return curves
 
 
-def print_table(results: list[dict[str, Any]]) -> None:
-    """Prints the figure as a Markdown table."""
+def markdown(results: list[dict[str, Any]]) -> str:
+    """The figure as a table."""
     curves = points(results)
     sizes = sorted({size for curve in curves.values() for size in curve})
-    print("| | " + " | ".join(f"{size:,}" for size in sizes) + " |\n|---|" + "---|" * len(sizes))
+    lines = ["| | " + " | ".join(f"{size:,}" for size in sizes) + " |", "|---|" + "---|" * len(sizes)]
     for env, methods in cells.METHODS.items():
         for method in methods:
             curve = curves.get((env, method), {})
@@ -88,7 +88,8 @@ def print_table(results: list[dict[str, Any]]) -> None:
                 for size in sizes
             ]
             if curve:
-                print(f"| {env}: {LABELS[method]} | {' | '.join(shown)} |")
+                lines.append(f"| {env}: {LABELS[method]} | {' | '.join(shown)} |")
+    return "\n".join(lines)
 
 
 def draw(results: list[dict[str, Any]], path: pathlib.Path) -> None:
@@ -121,7 +122,7 @@ def main(_: list[str]) -> None:
         run_cells()
     folder = options.folder("figure3")
     results = list(cells.read(folder).values())
-    print_table(results)
+    print(markdown(results))
     draw(results, pathlib.Path(_FIGURE.value or folder / "figure3.png"))
 
 

@@ -49,20 +49,20 @@ def mean(group: list[dict]) -> str:
     return f"| {' | '.join(cells)} |"
 
 
-def main(experiment: str) -> None:
-    """Prints the table."""
-    folder = pathlib.Path(__file__).parent / "results" / experiment
+def markdown(folder: pathlib.Path) -> str:
+    """All results of a folder, and the mean of each setting's seeds."""
     groups = collections.defaultdict(list)
     for path in sorted(folder.glob("*.json")):
         result = json.loads(path.read_text())
         groups[result["method"], result["preset"], result["variant"]].append(result)
-    print("| method | preset | seed | success (95%) | trials | random | task-blind | expert | from nothing | on |")
-    print("|---|---|---|---|---|---|---|---|---|---|")
+    lines = ["| method | preset | seed | success (95%) | trials | random | task-blind | expert | from nothing | on |"]
+    lines.append("|---|---|---|---|---|---|---|---|---|---|")
     for group in groups.values():
-        print("\n".join(row(result) for result in group))
+        lines += [row(result) for result in group]
         if len(group) > 1:
-            print(mean(group))
+            lines.append(mean(group))
+    return "\n".join(lines)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    print(markdown(pathlib.Path(__file__).parent / "results" / sys.argv[1]))

@@ -6,6 +6,8 @@
 Stopped and started again it goes on with the next cell.
 """
 
+from typing import Any
+
 import cells
 import tables
 from absl import app, flags
@@ -15,6 +17,17 @@ from milx.config import GIVEN
 
 flags.adopt_module_key_flags(tables)
 
+PAPER = {
+    "lstm-video-state-action": "78.4%",
+    "lstm-video-state": "37.6%",
+    "lstm-video": "34.2%",
+    "contextual-video-state": "58.1%",
+    "contextual-video": "57.0%",
+    "mil-video-state-action": "80.6 / 82.6%",
+    "mil-video-state": "72.5 / 78.2%",
+    "mil-video": "66.4 / 70.5%",
+}
+LABELS = {"mil": "MIL", "lstm": "LSTM", "contextual": "contextual"}
 TEMPORAL = {"network.learned_loss": "temporal", "train.support_frames": None, "train.meta_batch": 16}
 """The loss that convolves over time sees all frames, of fewer tasks."""
 ROBOT_HEAD = {"mil.given": "video", "network.learned_loss": "linear", "network.robot_head": True}
@@ -22,15 +35,20 @@ ROBOT_HEAD = {"mil.given": "video", "network.learned_loss": "linear", "network.r
 
 
 def _rows() -> dict[str, Row]:
-    rows = {}
+    rows: dict[str, Row] = {}
+
+    def add(name: str, label: str, method: str, changes: dict[str, Any]) -> None:
+        rows[name] = Row(label, method, changes, PAPER.get(name, ""))
+
     for given in GIVEN:
-        name = given.replace("+", "-")
+        name, shown = given.replace("+", "-"), given.replace("+", " + ")
         for method in cells.METHODS["push"]:
             learned = "linear" if method == "mil" and given != GIVEN[0] else None
-            rows[f"{method}-{name}"] = Row(method, {"mil.given": given, "network.learned_loss": learned})
+            changes = {"mil.given": given, "network.learned_loss": learned}
+            add(f"{method}-{name}", f"{LABELS[method]}, {shown}", method, changes)
         if given != GIVEN[0]:
-            rows[f"mil-temporal-{name}"] = Row("mil", {"mil.given": given, **TEMPORAL})
-    rows["mil-robot-head-video"] = Row("mil", ROBOT_HEAD)
+            add(f"mil-temporal-{name}", f"MIL with a temporal loss, {shown}", "mil", {"mil.given": given, **TEMPORAL})
+    add("mil-robot-head-video", "MIL with a robot head, video", "mil", ROBOT_HEAD)
     return rows
 
 

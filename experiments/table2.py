@@ -16,7 +16,10 @@ ONE_HEAD = "mil-video-state-action"
 TABLE = Table(
     "table1",
     "push",
-    {ONE_HEAD: table1.TABLE.rows[ONE_HEAD], "two-heads": Row("mil", {"network.heads": 2})},
+    {
+        ONE_HEAD: table1.TABLE.rows[ONE_HEAD],
+        "two-heads": Row("MIL, two heads", "mil", {"network.heads": 2}, "85.8 / 88.8%"),
+    },
     shots=(1, 5),
 )
 

@@ -15,10 +15,19 @@ _ROWS = flags.DEFINE_list("rows", None, "Which rows; default all.")
 
 
 class Row(NamedTuple):
-    """A method, and what is changed of its preset, by dotted name."""
+    """A way to train.
 
+    Attributes:
+        label: what the table calls it.
+        method: the method.
+        changes: what is changed of its preset, by dotted name.
+        paper: what the paper reports.
+    """
+
+    label: str
     method: str
     changes: dict[str, Any]
+    paper: str = ""
 
 
 class Table(NamedTuple):
@@ -64,37 +73,39 @@ def make(table: Table) -> None:
             of_shots = {f"{name}-{shots}-{seed}": configure(table.env, row, shots, seed) for shots in table.shots}
             tasks = configure(table.env, row, 1, seed).data.tasks
             runners.setdefault(tasks, cells.Cells(folder, tasks)).run(of_shots)
-    found = cells.read(folder)
-    print(markdown({name: [_of_seeds(found, f"{name}-{k}") for k in table.shots] for name in rows}, table.shots))
+    print(markdown(table, list(rows), cells.read(folder)))
+
+
+def markdown(table: Table, rows: list[str], found: dict[str, dict[str, Any]]) -> str:
+    """A table for every criterion: means of the seeds, their intervals, and what floors and expert reach beside them.
+
+    Args:
+        table: the table.
+        rows: the names of those to show; such as have no result are left out.
+        found: all results, by the names of their cells.
+    """
+    runs = {name: [_of_seeds(found, f"{name}-{shots}") for shots in table.shots] for name in rows}
+    runs = {name: columns for name, columns in runs.items() if all(columns)}
+    if not runs:
+        return "No results yet."
+    longest = max(runs.values(), key=lambda columns: len(columns[0]))
+    first, lines = longest[0][0], []
+    head = [f"{k}-shot" for k in table.shots] + ["paper"]
+    for criterion in (first["criterion"], *first.get("other_criteria", ())):
+        lines += [f"| {criterion} | {' | '.join(head)} |", "|---|" + "---|" * len(head)]
+        for name, columns in runs.items():
+            shown = [interval([judged(run, criterion) for run in seeds]) for seeds in columns]
+            lines.append(f"| {table.rows[name].label} | {' | '.join(shown)} | {table.rows[name].paper} |")
+        floors = [[judged(run, criterion)["baselines"] for run in seeds] for seeds in longest]
+        for name in ("random", "task_blind", "expert"):
+            shown = [f"{statistics.mean(run[name] for run in seeds):.1%}" for seeds in floors]
+            lines.append(f"| *{name.replace('_', '-')}* | {' | '.join(shown)} | |")
+        lines.append("")
+    return "\n".join([*lines, f"{first['trials']} trials for each seed; in brackets their intervals and their number."])
 
 
 def _of_seeds(found: dict[str, dict[str, Any]], name: str) -> list[dict[str, Any]]:
     return [found[cell] for seed in range(options.SEEDS.value) if (cell := f"{name}-{seed}") in found]
-
-
-def markdown(runs: dict[str, list[list[dict[str, Any]]]], shots: tuple[int, ...]) -> str:
-    """A table for every criterion: means of the seeds, their intervals, and what floors and expert reach beside them.
-
-    Args:
-        runs: result files of every row, by column and seed.
-        shots: the columns.
-    """
-    complete = [columns for columns in runs.values() if all(columns)]
-    if not complete:
-        return "No row is complete."
-    longest = max(complete, key=lambda columns: len(columns[0]))
-    first, lines = longest[0][0], []
-    for criterion in (first["criterion"], *first.get("other_criteria", ())):
-        lines += [f"| {criterion} | " + " | ".join(f"{k}-shot" for k in shots) + " |", "|---|" + "---|" * len(shots)]
-        for name, columns in runs.items():
-            shown = [interval([judged(run, criterion) for run in seeds]) for seeds in columns]
-            lines.append(f"| {name} | {' | '.join(shown)} |")
-        floors = [[judged(run, criterion)["baselines"] for run in seeds] for seeds in longest]
-        for name in ("random", "task_blind", "expert"):
-            shown = [f"{statistics.mean(run[name] for run in seeds):.1%}" for seeds in floors]
-            lines.append(f"| *{name.replace('_', '-')}* | {' | '.join(shown)} |")
-        lines.append("")
-    return "\n".join([*lines, f"{first['trials']} trials for each seed; in brackets their intervals and their number."])
 
 
 def judged(run: dict[str, Any], criterion: str) -> dict[str, Any]:
@@ -103,8 +114,6 @@ def judged(run: dict[str, Any], criterion: str) -> dict[str, Any]:
 
 
 def interval(runs: list[dict[str, Any]]) -> str:
-    """The mean over runs, from where to where their 95% intervals reach, and how many there are; "" for none."""
-    if not runs:
-        return ""
+    """The mean over runs, from where to where their 95% intervals reach, and how many there are."""
     low, high = min(run["wilson95"][0] for run in runs), max(run["wilson95"][1] for run in runs)
     return f"{statistics.mean(run['success'] for run in runs):.1%} ({low:.1%} to {high:.1%}; {len(runs)})"

@@ -51,13 +51,13 @@ def main(_: list[str]) -> None:
             names = {candidate: f"{env}-{method}-{candidate.replace(', ', '-')}" for candidate in CANDIDATES}
             for candidate, name in names.items():
                 config = configure(env, method, candidate)
-                if not runner.is_done(name, config):
+                if not options.SHOW.value and not runner.is_done(name, config):
                     trained = runner.train(name, config)
                     row: dict[str, Any] = {"env": env, "method": method, "candidate": candidate}
                     row |= {"validation_success": trained.validation, "wall_clock_s": trained.seconds}
                     runner.write(name, row | {"config": config_lib.to_dict(config)} | provenance.describe())
             found = cells.read(folder)
-            shown = [f"{found[name]['validation_success']:.1%}" for name in names.values()]
+            shown = [f"{found[name]['validation_success']:.1%}" if name in found else "" for name in names.values()]
             print(f"| {env} | {method} | {' | '.join(shown)} |", flush=True)
 
 

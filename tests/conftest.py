@@ -43,7 +43,7 @@ class Trained:
 
 
 FIRST = (
-    *("test_run.py", "test_notebook.py", "test_parallel.py"),
+    *("test_run.py", "test_parallel.py", "test_notebook.py"),
     *("test_cells.py", "test_demos.py", "test_evaluator.py", "test_policy.py"),
 )
 """The files that take longest, so that in the end no process is left alone with one of them."""
