@@ -6,8 +6,10 @@ import sys
 import pytest
 
 sys.path.insert(0, str(pathlib.Path(__file__).parents[2] / "experiments"))
+import ablations
 import cells
 import figure3
+import table
 import table1
 import table2
 import table3
@@ -47,22 +49,38 @@ def test_an_unknown_row_is_refused(flags):
         tables.make(table2.TABLE)
 
 
-def test_a_table_shows_means_intervals_floors_and_every_criterion():
+def test_a_table_shows_means_intervals_floors_and_every_criterion(flags):
     def run(success, low, high, near):
         floors = {"random": 0.1, "task_blind": 0.25, "expert": 0.9}
         other = {"success": near, "wilson95": [near - 0.1, near + 0.1], "baselines": floors | {"random": 0.3}}
         mine = {"success": success, "wilson95": [low, high], "baselines": floors, "trials": 50}
         return mine | {"criterion": "on it", "other_criteria": {"near it": other}}
 
-    text = tables.markdown({"one": [[run(0.5, 0.4, 0.6, 0.7), run(0.7, 0.65, 0.75, 0.8)]], "two": [[]]}, (1,))
-    lines = text.splitlines()
-    assert lines[0] == "| on it | 1-shot |"
-    assert lines[2] == "| one | 60.0% (40.0% to 75.0%; 2) |"
-    assert lines[3:7] == ["| two |  |", "| *random* | 10.0% |", "| *task-blind* | 25.0% |", "| *expert* | 90.0% |"]
-    assert lines[8] == "| near it | 1-shot |"
-    assert lines[10:12] == ["| one | 75.0% (60.0% to 90.0%; 2) |", "| two |  |"]
-    assert lines[12] == "| *random* | 30.0% |"
+    rows = {name: tables.Row(name.capitalize(), "mil", {}, "80%") for name in ("one", "two")}
+    found = {"one-1-0": run(0.5, 0.4, 0.6, 0.7), "one-1-1": run(0.7, 0.65, 0.75, 0.8), "two-5-0": run(0.1, 0, 1, 0)}
+    lines = tables.markdown(tables.Table("folder", "push", rows, (1,)), ["one", "two"], found).splitlines()
+    assert lines[0] == "| on it | 1-shot | paper |"
+    assert lines[2] == "| One | 60.0% (40.0% to 75.0%; 2) | 80% |"
+    assert lines[3:6] == ["| *random* | 10.0% | |", "| *task-blind* | 25.0% | |", "| *expert* | 90.0% | |"], "no Two"
+    assert lines[7] == "| near it | 1-shot | paper |"
+    assert lines[9:11] == ["| One | 75.0% (60.0% to 90.0%; 2) | 80% |", "| *random* | 30.0% | |"]
     assert lines[-1].startswith("50 trials for each seed")
+
+
+def test_readme_shows_what_the_scripts_print(flags):
+    """Line by line; where there are several criteria, those of the first."""
+    root = pathlib.Path(__file__).parents[2]
+    readme, results = (root / "README.md").read_text().splitlines(), root / "experiments" / "results"
+    printed = [table.markdown(results / name) for name in ("reach", "push")]
+    for one in (table1, table2, table3):
+        found = cells.read(results / one.TABLE.folder)
+        printed.append(tables.markdown(one.TABLE, list(one.TABLE.rows), found).split("\n\n")[0])
+    printed.append(ablations.markdown(cells.read(results / "ablations"), list(ablations.ABLATIONS), seeds=2))
+    printed.append(figure := figure3.markdown(list(cells.read(results / "figure3").values())))
+    lines = [line for text in printed for line in text.splitlines()]
+    assert len(lines) > 50
+    assert [line for line in lines if line not in readme] == []
+    assert figure in (root / "BUILD.md").read_text()
 
 
 @pytest.fixture
