@@ -87,6 +87,7 @@ class SimulatedRun(Run):
             expected = f"more than train.shots = {config.train.shots}: another one is the query"
             raise ValueError(f"data.demos_per_task: got {config.data.demos_per_task}, expected {expected}")
         self.env = envs.make(config.env_name, config.env.image_shape)
+        self._demonstrations: dict[str, dict[str, float]] = {}
         sample = demos_lib.sampler(self.env, config.train)
         super().__init__(config, spec_of(self.env), sample, self.env.chain, workdir, console)
 
@@ -95,6 +96,7 @@ class SimulatedRun(Run):
         with self._clock("demos"), self.console.status(f"planning {split} demonstrations"):
             demos = split_demos(self.env, self.config, split)
         count, success = demos.success.size, float(demos.success.mean())
+        self._demonstrations[split] = {"count": count, "success": success}
         self.console.print(f"{count} {split} demonstrations, of which {success:.1%} succeed")
         return demos
 
@@ -142,7 +144,8 @@ class SimulatedRun(Run):
             report.learning_curve(metrics, result, self.folder / "learning_curve.png")
             self._film(test, trials)
 
-        return evaluator.describe(self.env, self.config, trials, floors), draw
+        found = evaluator.describe(self.env, self.config, trials, floors)
+        return found | {"demonstrations": self._demonstrations}, draw
 
     def _film(self, test: DemoSet, trials: Trials, num_tasks: int = 3) -> None:
         """Writes the video: demonstrations beside the first trial of the same held-out tasks, in large."""

@@ -183,6 +183,9 @@ def test_evaluation_is_a_result_file(trained):
     assert set(result) >= RESULT_FIELDS
     assert (result["env"], result["method"], result["preset"], result["seed"]) == ("reach", "mil", "cpu", 0)
     assert (result["num_tasks_train"], result["num_demos_train"], result["trials"]) == (8, 24, 6)
+    for split in ("train", "validation", "test"):
+        success = getattr(trained, split).success
+        assert result["demonstrations"][split] == {"count": success.size, "success": pytest.approx(success.mean())}
     low, high = result["wilson95"]
     assert 0 <= low <= result["success"] <= high <= 1
     assert high - low > 0.3, "six trials tell little"
