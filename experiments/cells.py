@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 
 from milx import config as config_lib
-from milx import envs, evaluator, methods, platform, results
+from milx import envs, evaluator, methods, platform, pytrees, results
 from milx.config import Config
 from milx.data import demos as demos_lib
 from milx.data.demos import DemoSet
@@ -149,7 +149,7 @@ class Cells:
         demos_s, _, evaluate_s = (later - earlier for earlier, later in itertools.pairwise(clock))
         seconds = {"demos": demos_s, **trained.seconds, "evaluate": trained.seconds["evaluate"] + evaluate_s}
         seconds["total"] = sum(seconds.values())
-        digest = demos_lib.fingerprint(train)
+        digest = pytrees.fingerprint(train)
         result = results.describe(config, found, seconds, trained.step, digest)
         return result | {"validation_success": trained.validation}
 

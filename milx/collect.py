@@ -2,14 +2,13 @@
 
     python -m milx.collect --env=reach --workdir=demos --config.data.tasks=100
 
-A file holds states, actions and tasks; `milx.data.demos.load` reads it.
+A file holds states, actions and tasks; `milx.pytrees.load` reads it.
 """
 
 import pathlib
 
-from milx import envs, launch, validate
+from milx import envs, launch, pytrees, validate
 from milx.config import Config
-from milx.data import demos as demos_lib
 from milx.simulation import split_demos
 
 
@@ -20,7 +19,7 @@ def main(config: Config, workdir: str) -> None:
     for split in envs.SPLITS:
         demos = split_demos(env, config, split)
         path = pathlib.Path(workdir) / f"{split}.npz"
-        demos_lib.save(path, demos)
+        pytrees.save(path, demos)
         print(f"{path}: {demos.num_tasks} tasks x {demos.num_demos}, {float(demos.success.mean()):.1%} succeed")
 
 

@@ -4,13 +4,8 @@ import json
 import pathlib
 from typing import Any
 
-import jax
-import jax.numpy as jnp
-import numpy as np
-
 from milx import config as config_lib
-from milx import envs, methods, policy
-from milx.data import demos as demos_lib
+from milx import envs, methods, policy, pytrees
 from milx.policy import Policy, params_like, spec_of
 
 FOLDER = pathlib.Path(__file__).parent / "pretrained"
@@ -22,7 +17,7 @@ def names() -> list[str]:
 
 
 def result(name: str) -> dict[str, Any]:
-    """What one of them reached: the evaluation.json of its run, and a hash of the parameters (`demos.fingerprint`)."""
+    """What one of them reached: the evaluation.json of its run, and `pytrees.fingerprint` of the parameters."""
     return json.loads((FOLDER / name / "result.json").read_text())
 
 
@@ -43,10 +38,8 @@ def load(run: str | pathlib.Path) -> Policy:
     config = config_lib.from_dict(result(str(run))["config"])
     spec = spec_of(envs.make(config.env_name, config.env.image_shape))
     method = methods.make(config, spec)
-    like = params_like(method, spec)
-    with np.load(FOLDER / run / "params.npz", allow_pickle=False) as arrays:
-        leaves = [jnp.asarray(arrays[name]) for name in demos_lib.leaves(like)]
-    return Policy(method, spec, jax.tree.unflatten(jax.tree.structure(like), leaves), config)
+    params = pytrees.load(FOLDER / run / "params.npz", like=params_like(method, spec))
+    return Policy(method, spec, params, config)
 
 
 def save(trained: Policy, reached: dict[str, Any], folder: pathlib.Path) -> None:
@@ -57,8 +50,6 @@ def save(trained: Policy, reached: dict[str, Any], folder: pathlib.Path) -> None
         reached: the run's evaluation.json, configuration included.
         folder: where to.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    arrays: dict[str, Any] = {name: np.asarray(leaf) for name, leaf in demos_lib.leaves(trained.params).items()}
-    np.savez_compressed(folder / "params.npz", **arrays)
-    digest = demos_lib.fingerprint(trained.params)
+    pytrees.save(folder / "params.npz", trained.params)
+    digest = pytrees.fingerprint(trained.params)
     (folder / "result.json").write_text(json.dumps(reached | {"params_hash": digest}, indent=1) + "\n")

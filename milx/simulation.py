@@ -12,7 +12,7 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from milx import envs, evaluator, platform, report, validate, whitening
+from milx import envs, evaluator, platform, pytrees, report, validate, whitening
 from milx.config import Config
 from milx.data import demos as demos_lib
 from milx.data.demos import DemoSet
@@ -59,7 +59,7 @@ def training_on(env: envs.Env, config: Config, train: DemoSet) -> Training:
         task, states = jax.tree.map(lambda x: x[:128], (train.task, train.states))
         return np.asarray(jax.jit(jax.vmap(env.render))(task, jax.tree.map(lambda x: x[:, 0, 0], states)))
 
-    return Training(demos_lib.fingerprint(train), statistics, lambda _: train, first_images)
+    return Training(pytrees.fingerprint(train), statistics, lambda _: train, first_images)
 
 
 @functools.partial(jax.jit, static_argnums=0)

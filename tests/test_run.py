@@ -12,9 +12,8 @@ from tiny import QUIET, tiny_config
 
 import milx
 from milx import config as config_lib
-from milx import methods
+from milx import methods, pytrees
 from milx.checkpoint import Checkpoints
-from milx.data import demos as demos_lib
 from milx.metrics import MetricsWriter
 from milx.networks import fixed
 from milx.policy import params_like, spec_of
@@ -190,7 +189,7 @@ def test_evaluation_is_a_result_file(trained):
     assert 0 <= low <= result["success"] <= high <= 1
     assert high - low > 0.3, "six trials tell little"
     assert config_lib.from_dict(result["config"]) == trained.config
-    assert result["dataset_hash"] == demos_lib.fingerprint(trained.train)
+    assert result["dataset_hash"] == pytrees.fingerprint(trained.train)
     assert set(result["baselines"]) == {"random", "task_blind", "expert"}
     for rate in (result["success"], *result["baselines"].values()):
         assert rate * 6 == pytest.approx(round(rate * 6), abs=1e-5)

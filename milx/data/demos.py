@@ -3,20 +3,18 @@
 import dataclasses
 import functools
 import hashlib
+import itertools
 import json
-import os
 import pathlib
 import sys
-import zipfile
 from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import mujoco
-import numpy as np
 
-from milx import parallel
+from milx import pytrees
 from milx.chunks import map_in_chunks
 from milx.config import DataConfig, TrainConfig
 from milx.envs.base import SPLITS, Env, State, Task
@@ -57,7 +55,15 @@ class DemoSet:
         return self.action.shape[1]
 
 
-def collect(env: Env, key: jax.Array, split: str, num_tasks: int, num_demos: int, config: DataConfig) -> DemoSet:
+def collect(
+    env: Env,
+    key: jax.Array,
+    split: str,
+    num_tasks: int,
+    num_demos: int,
+    config: DataConfig,
+    parts: pathlib.Path | None = None,
+) -> DemoSet:
     """Draws tasks of a split and plans demonstrations of each in scenes of their own.
 
     Args:
@@ -67,12 +73,20 @@ def collect(env: Env, key: jax.Array, split: str, num_tasks: int, num_demos: int
         num_tasks: N.
         num_demos: D.
         config: noise on the actions, and settings of the planner.
+        parts: how the names of files begin that keep what is planned at once, so that a process that was killed goes on
+            with the next; None for no files.
     """
     tasks, *inputs = _draw(env, jax.random.fold_in(key, SPLITS.index(split)), split, num_tasks, num_demos)
-    options = Options(iterations=config.plan_iterations)
-    states, action = map_in_chunks(
-        lambda *chunk: perform(env, *chunk, options, config.noise), tuple(inputs), config.plan_batch
-    )
+    options, numbers = Options(iterations=config.plan_iterations), itertools.count()
+
+    def plan_part(*part: Any) -> Any:
+        make = functools.partial(perform, env, *part, options, config.noise)
+        if parts is None:
+            return make()
+        path = parts.with_name(f"{parts.name}-{next(numbers)}.npz")
+        return pytrees.kept(path, make, lambda: jax.eval_shape(make))
+
+    states, action = map_in_chunks(plan_part, tuple(inputs), config.plan_batch)
     success, _ = map_in_chunks(functools.partial(judge, env), (inputs[0], states), config.plan_batch)
     states, action, success = _without_diverged(states, action, success)
     states, action, success = jax.tree.map(
@@ -222,60 +236,9 @@ def cached(
     for source in sorted(path for pattern in SOURCES for path in root.glob(pattern)):
         digest.update(source.read_bytes())
     path = folder / f"{env.name}-{split}-{digest.hexdigest()[:16]}.npz"
-    if parallel.on_all_hosts(path.is_file()):
-        try:
-            return load(path, like=shapes(env, num_tasks, num_demos))
-        except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
-            print(f"milx: {path} is damaged and planned again: {error}", file=sys.stderr)
-    demos = collect(env, jax.random.key(seed), split, num_tasks, num_demos, config)
-    save(path, demos)
+    parts = folder / f"{path.stem}.part-{config.plan_batch}"
+    make = functools.partial(collect, env, jax.random.key(seed), split, num_tasks, num_demos, config, parts)
+    demos = pytrees.kept(path, make, lambda: shapes(env, num_tasks, num_demos))
+    for part in folder.glob(f"{parts.name}-*.npz"):
+        part.unlink(missing_ok=True)
     return demos
-
-
-def leaves(arrays: Any) -> dict[str, Any]:
-    """All arrays of a pytree by name, such as "states.qpos", in a fixed order."""
-    pairs, _ = jax.tree_util.tree_flatten_with_path(arrays)
-    return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in pairs}
-
-
-def fingerprint(arrays: Any) -> str:
-    """Of a pytree: SHA-256 over names, types, shapes and contents of all arrays."""
-    digest = hashlib.sha256()
-    for name, leaf in leaves(arrays).items():
-        array = np.ascontiguousarray(leaf)
-        digest.update(f"{name} {array.dtype} {array.shape} ".encode())
-        digest.update(array.tobytes())
-    return digest.hexdigest()
-
-
-def save(path: pathlib.Path, demos: DemoSet) -> None:
-    """Writes a set as one .npz file; a file of that name is replaced only once the new one is complete."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_suffix(f".partial{os.getpid()}.npz")
-    arrays: dict[str, Any] = {name: np.asarray(leaf) for name, leaf in leaves(demos).items()}
-    np.savez_compressed(partial, **arrays)
-    partial.replace(path)
-
-
-def load(path: pathlib.Path, like: DemoSet) -> DemoSet:
-    """Reads a set written by `save`.
-
-    Args:
-        path: the .npz file.
-        like: a set (of arrays or shapes) with the expected names, types and shapes, say from `jax.eval_shape`.
-
-    Raises:
-        ValueError: for an array that is missing or has another type or shape; the message names it.
-    """
-    loaded = []
-    with np.load(path, allow_pickle=False) as arrays:
-        for name, expected in leaves(like).items():
-            if name not in arrays:
-                raise ValueError(f"{path}: {name}: missing, expected {expected.dtype} {expected.shape}")
-            array = arrays[name]
-            if array.shape != expected.shape or array.dtype != expected.dtype:
-                raise ValueError(
-                    f"{path}: {name}: got {array.dtype} {array.shape}, expected {expected.dtype} {expected.shape}"
-                )
-            loaded.append(jnp.asarray(array))
-    return jax.tree.unflatten(jax.tree.structure(like), loaded)

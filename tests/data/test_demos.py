@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import milx
+from milx import pytrees
 from milx.data import demos as demos_lib
 
 MANY = 4
@@ -19,7 +20,7 @@ MANY = 4
 @pytest.fixture(scope="module")
 def file(trained, tmp_path_factory):
     path = tmp_path_factory.mktemp("demos") / "sub" / "train.npz"
-    demos_lib.save(path, trained.train)
+    pytrees.save(path, trained.train)
     return path
 
 
@@ -30,17 +31,17 @@ def like(trained):
 
 def assert_equal(found, expected):
     assert jax.tree.structure(found) == jax.tree.structure(expected)
-    for name, leaf in demos_lib.leaves(expected).items():
-        other = demos_lib.leaves(found)[name]
+    for name, leaf in pytrees.leaves(expected).items():
+        other = pytrees.leaves(found)[name]
         assert other.dtype == leaf.dtype, name
         np.testing.assert_array_equal(other, leaf, err_msg=name)
 
 
 def test_saved_set_loads_equal(trained, file, like):
-    loaded = demos_lib.load(file, like)
+    loaded = pytrees.load(file, like)
     assert_equal(loaded, trained.train)
     assert (loaded.num_tasks, loaded.num_demos) == (8, 3)
-    assert demos_lib.fingerprint(loaded) == demos_lib.fingerprint(trained.train)
+    assert pytrees.fingerprint(loaded) == pytrees.fingerprint(trained.train)
     assert [path.name for path in file.parent.iterdir()] == ["train.npz"]
 
 
@@ -62,12 +63,12 @@ def test_file_that_does_not_fit_is_refused(file, like, tmp_path, name, change, m
     path = tmp_path / "other.npz"
     np.savez(path, **arrays)
     with pytest.raises(ValueError) as error:
-        demos_lib.load(path, like)
+        pytrees.load(path, like)
     assert str(error.value) == f"{path}: {message}"
 
 
 def test_fingerprint_sees_every_number(trained):
-    original = demos_lib.fingerprint(trained.train)
+    original = pytrees.fingerprint(trained.train)
     leaves, structure = jax.tree.flatten(trained.train)
     seen = {original}
     for i, leaf in enumerate(leaves):
@@ -80,9 +81,9 @@ def test_fingerprint_sees_every_number(trained):
             if (array.dtype.kind == "f")
             else last + 1
         )
-        seen.add(demos_lib.fingerprint(jax.tree.unflatten(structure, [*leaves[:i], array, *leaves[i + 1 :]])))
+        seen.add(pytrees.fingerprint(jax.tree.unflatten(structure, [*leaves[:i], array, *leaves[i + 1 :]])))
     assert len(seen) == len(leaves) + 1
-    assert demos_lib.fingerprint(jax.tree.map(np.array, trained.train)) == original
+    assert pytrees.fingerprint(jax.tree.map(np.array, trained.train)) == original
 
 
 def test_cache_gives_what_it_planned(trained, cache):
@@ -97,7 +98,7 @@ def test_cache_gives_what_it_planned(trained, cache):
 def test_cache_notices_other_arguments(trained, tmp_path, monkeypatch):
     data, asked = trained.config.data, []
 
-    def collect(env, key, split, num_tasks, num_demos, config):
+    def collect(env, key, split, num_tasks, num_demos, config, parts):
         asked.append((split, num_tasks, num_demos, config.noise, config.plan_iterations))
         return jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), demos_lib.shapes(env, num_tasks, num_demos))
 
@@ -119,11 +120,34 @@ def test_cache_notices_other_arguments(trained, tmp_path, monkeypatch):
     assert len(asked) == len(requests), "the batch of the planner does not change the set"
 
 
+def test_planning_that_was_killed_goes_on_with_the_next_part(trained, tmp_path, monkeypatch, capsys):
+    """24 demonstrations are planned 10 at once; the second part is damaged meanwhile."""
+    perform, calls = demos_lib.perform, []
+
+    def killed(*arguments):
+        calls.append(arguments)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return perform(*arguments)
+
+    monkeypatch.setattr(demos_lib, "perform", killed)
+    arguments = (tmp_path, trained.run.env, trained.config.seed, "train", 8, 3, trained.config.data)
+    with pytest.raises(KeyboardInterrupt):
+        demos_lib.cached(*arguments)
+    parts = sorted(tmp_path.glob("*.part-10-*.npz"))
+    assert [path.name[-5:] for path in parts] == ["0.npz", "1.npz"]
+    parts[1].write_bytes(parts[1].read_bytes()[:1000])
+    assert_equal(demos_lib.cached(*arguments), trained.train)
+    assert len(calls) == 3 + 2 + 2, "the second part again, and the third; for two files their shapes"
+    assert f"{parts[1]} is damaged and made again" in capsys.readouterr().err
+    assert len(list(tmp_path.iterdir())) == 1, "the parts are gone"
+
+
 def test_the_hash_of_a_cached_set_covers_the_sources_that_it_depends_on():
     """What environments and experts import of milx is hashed, or does not touch what is planned."""
     root = pathlib.Path(milx.__file__).parent
     hashed = {path for pattern in demos_lib.SOURCES for path in root.glob(pattern)}
-    harmless = {"parallel", "chunks", "config", "goals", "types", "render.raycast", "render.scene"}
+    harmless = {"parallel", "chunks", "config", "pytrees", "goals", "types", "render.raycast", "render.scene"}
     imported = set()
     for path in hashed:
         for node in ast.walk(ast.parse(path.read_text()) if path.suffix == ".py" else ast.Module([], [])):
