@@ -5,6 +5,8 @@
 
 import dataclasses
 import functools
+import json
+import pathlib
 import typing
 from typing import Any
 
@@ -235,6 +237,18 @@ def from_dict(values: dict[str, Any]) -> Config:
     config = _build(Config, values, "config")
     validate.check(config)
     return config
+
+
+def read(path: pathlib.Path) -> Config:
+    """The configuration in a JSON file.
+
+    Raises:
+        ValueError: if it holds none; the message names the file.
+    """
+    try:
+        return from_dict(json.loads(path.read_text()))
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: expected a configuration: {error}") from error
 
 
 def flatten(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -5,7 +5,6 @@
 rewrites evaluation.json, the plot and the video in the run's folder.
 """
 
-import json
 import pathlib
 import sys
 
@@ -26,7 +25,7 @@ def main(argv: list[str]) -> None:
     if not path.is_file():
         sys.exit(f"milx: workdir: {path.parent} has no config.json, expected a folder of `python -m milx.train`")
     try:
-        run = runs.make(config_lib.from_dict(json.loads(path.read_text())), path.parent)
+        run = runs.make(config_lib.read(path), path.parent)
         run.report(run.evaluate())
     except ValueError as error:
         sys.exit(f"milx: {error}")

@@ -99,9 +99,12 @@ def load(run: str | pathlib.Path) -> Policy:
     path = folder / "config.json"
     if not path.is_file():
         raise ValueError(f"run: {folder} has no config.json, expected a folder written by `python -m milx.train`")
-    config = config_lib.from_dict(json.loads(path.read_text()))
+    config = config_lib.read(path)
     if (folder / SPEC_FILE).is_file():
-        spec = Spec.from_dict(json.loads((folder / SPEC_FILE).read_text()))
+        try:
+            spec = Spec.from_dict(json.loads((folder / SPEC_FILE).read_text()))
+        except (ValueError, TypeError, AttributeError, RecursionError) as error:
+            raise ValueError(f"{folder / SPEC_FILE}: expected the sizes of a policy: {error}") from error
     else:
         spec = spec_of(envs.make(config.env_name, config.env.image_shape))
     method = methods.make(config, spec)

@@ -30,7 +30,8 @@ def load(run: str | pathlib.Path) -> Policy:
     Raises:
         ValueError: for neither, or a run that has no checkpoint yet.
     """
-    if pathlib.Path(run).exists():
+    is_run = (pathlib.Path(run) / "config.json").is_file()
+    if is_run or (pathlib.Path(run).exists() and run not in names()):
         return policy.load(run)
     if run not in names():
         expected = f"the folder of a run, or one of {', '.join(names())}, which ship with milx"

@@ -34,7 +34,7 @@ def make_config(path: str | pathlib.Path, method: str = "mil", preset: str = "fa
         ValueError: for a path that holds no data set, or a preset that does not exist.
     """
     config, head = presets.make_config(RECORDED, method, preset, seed), DataSet(path).header
-    config.recorded.path = str(path)
+    config.recorded.path = str(pathlib.Path(path).resolve())
     if head.image_shape is None:
         config.network.filters = config.network.strides = ()
         config.network.soft_argmax = config.network.mixed_precision = False
@@ -206,7 +206,8 @@ class RecordedRun(Run):
     def _task(self, task: int, shots: int) -> tuple[Recorded, Demo]:
         """A task's queries [D, T, ...], and its first `shots` demonstrations that may be shown as the support."""
         info, horizon = self.data.header.tasks[task], self.config.recorded.horizon
-        numbers = list(range(len(info.lengths)))
+        # Those without actions first, where they will do: the others are to be asked.
+        numbers = sorted(range(len(info.lengths)), key=lambda i: info.has_action[i] and not self.given_action)
         shown = [i for i in numbers if info.has_action[i] or not self.given_action][:shots]
         asked = [i for i in numbers if info.has_action[i] and i not in shown][: MOST_DEMOS - shots]
         recorded = jax.tree.map(lambda x: x[0], load(self.data, [task], [[*shown, *asked]], horizon))

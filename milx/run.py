@@ -12,7 +12,6 @@ learning_curve.png
 import abc
 import contextlib
 import dataclasses
-import json
 import pathlib
 import tempfile
 import time
@@ -165,7 +164,8 @@ class Run(abc.ABC):
         with guard.one_trainer(self.folder), stop.listen():
             self._claim_folder()  # another process may have written its own configuration before this one had the lock
             for leftover in self.folder.glob("*.partial*"):
-                leftover.unlink()
+                if leftover.is_file():
+                    leftover.unlink()
             self._train(stop)
 
     def _train(self, stop: guard.Stop) -> None:
@@ -302,7 +302,7 @@ class Run(abc.ABC):
         path = self.folder / "config.json"
         mine = config_lib.to_dict(self.config)
         if path.is_file():
-            theirs = config_lib.to_dict(config_lib.from_dict(json.loads(path.read_text())))
+            theirs = config_lib.to_dict(config_lib.read(path))
             changed = config_lib.differences(theirs, mine)
             if changed:
                 raise ValueError(f"workdir: {self.folder} holds another run: {'; '.join(changed)}")

@@ -86,7 +86,7 @@ def _check_value(name: str, value: Any, hint: Any) -> None:
 def _check_number(name: str, value: Any, hint: type) -> None:
     allowed = (int,) if hint is int else (int, float)
     least, most = _LIMITS.get(name, (1, _LARGE))
-    if not isinstance(value, allowed) or isinstance(value, bool) or not least <= value <= most or math.isinf(value):
+    if not isinstance(value, allowed) or isinstance(value, bool) or not least <= value <= min(most, 1e30):
         kind = "a whole number" if hint is int else "a finite number"
         bounds = f"at least {least}" + ("" if most in (_LARGE, math.inf) else f" and at most {most}")
         raise ValueError(f"{name}: got {value!r}, expected {kind}, {bounds}")

@@ -7,7 +7,7 @@ from absl import app
 from rich.console import Console
 from rich.table import Table
 
-from milx.data.dataset import DataSet
+from milx.data.dataset import DataSet, check_size
 from milx.envs.base import SPLITS
 from milx.whitening import MIN_STD
 
@@ -50,7 +50,13 @@ def problems(data: DataSet) -> list[str]:
 
 
 def vectors(data: DataSet) -> dict[str, np.ndarray]:
-    """All states [F, S] and actions [F', A] there are."""
+    """All states [F, S] and actions [F', A] there are.
+
+    Raises:
+        ValueError: if they are too large for the memory.
+    """
+    steps = sum(sum(task.lengths) for task in data.header.tasks)
+    check_size(f"{data.folder}: states and actions", (steps, data.header.state_size + data.header.action_size), 4)
     rows: dict[str, list[np.ndarray]] = {"state": [], "action": []}
     for number, task in enumerate(data.header.tasks):
         for demo in range(len(task.lengths)):
@@ -90,12 +96,12 @@ def main(argv: list[str]) -> None:
     """Prints what a data set holds, and its problems."""
     if len(argv) != 2:
         raise app.UsageError("expected one argument, PATH")
-    console = Console()
+    console = Console(markup=False)  # names of tasks are anybody's
     try:
         data = DataSet(argv[1])
         describe(data, console)
         found = problems(data)
-    except ValueError as error:
+    except (ValueError, OSError) as error:
         sys.exit(f"milx: {error}")
     for problem in found:
         console.print(f"- {problem}")

@@ -6,6 +6,8 @@
         state               [F, S] float32
         action              [F, A] float32, NaN where a demonstration shows none
 
+Every chunk carries a checksum, so one that has changed or is missing is noticed when it is read.
+
 The header names every task, its split ("train", "validation" or "test") and the lengths of its demonstrations.
 """
 
@@ -29,6 +31,7 @@ ALL_FIELDS = ("image", "state", "action")
 MAX_BYTES = 1 << 33
 """Of an array that has to be in memory at once: a larger one is refused before there is memory for it."""
 _CHUNK_BYTES = 1 << 20
+_MAX_CHUNK_BYTES = 1 << 28
 _GROUP = {"zarr_format": 3, "node_type": "group"}
 
 
@@ -86,7 +89,7 @@ class Writer:
         source: where the demonstrations come from.
 
     Raises:
-        ValueError: if the folder exists: nothing is written over.
+        ValueError: if the folder exists, as nothing is written over, or there are no actions.
     """
 
     def __init__(
@@ -100,6 +103,8 @@ class Writer:
         self.folder = pathlib.Path(folder)
         if self.folder.exists():
             raise ValueError(f"out: {self.folder} exists, expected a folder that does not: nothing is written over")
+        if action_size < 1:
+            raise ValueError(f"action_size: got {action_size}, expected at least 1: there is nothing to imitate")
         self._header = Header(image_shape, state_size, action_size, (), source)
         self._tasks: list[TaskInfo] = []
         self._partial = self.folder.with_name(f"{self.folder.name}.partial")
@@ -129,8 +134,11 @@ class Writer:
             demos: as many; with arrays [T, ...], and no action where the demonstration shows none.
 
         Raises:
-            ValueError: for a split that does not exist, or a demonstration of another shape than announced.
+            ValueError: for a split that does not exist, or a demonstration without time steps or of another shape than
+                announced.
         """
+        if 0 in lengths:
+            raise ValueError(f"demonstration {lengths.index(0)} of {name!r}: got no time steps, expected at least one")
         if split not in SPLITS:
             raise ValueError(f"split of {name!r}: got {split!r}, expected one of {', '.join(SPLITS)}")
         folder, total, head = self._partial / f"{len(self._tasks):05d}", sum(lengths), self._header
@@ -181,7 +189,9 @@ class DataSet:
         for i in range(len(self.header.tasks)):
             for field in ("state", "action"):
                 if field in _fields(self.header):
-                    digest.update(np.ascontiguousarray(self._array(i, field).read().result()).tobytes())
+                    array = self._array(i, field)
+                    check_size(f"{self.folder}: {field} of task {i}", array.shape, array.dtype.numpy_dtype.itemsize)
+                    digest.update(np.ascontiguousarray(self._wait(array.read())).tobytes())
         return digest.hexdigest()
 
     def read(
@@ -206,9 +216,15 @@ class DataSet:
         begun = {field: array[rows].read() for field, array in arrays.items()}
 
         def finish() -> Demo:
-            return Demo(**{field: future.result() for field, future in begun.items()})
+            return Demo(**{field: self._wait(future) for field, future in begun.items()})
 
         return finish
+
+    def _wait(self, future: Any) -> np.ndarray:
+        try:
+            return future.result()
+        except ValueError as error:  # a chunk is missing, or does not fit its checksum
+            raise ValueError(f"{self.folder}: a chunk is damaged, expected what was written: {error}") from error
 
     def _array(self, task: int, field: str) -> Any:
         key = (task, field)
@@ -216,13 +232,19 @@ class DataSet:
             path = self.folder / f"{task:05d}" / field
             shape, dtype = _fields(self.header)[field]
             expected = (sum(self.header.tasks[task].lengths), *shape)
+            if not path.resolve().is_relative_to(self.folder.resolve()):
+                raise ValueError(f"{path}: leads out of the data set's folder, expected a folder inside")
+            spec = {"driver": "zarr3", "kvstore": _kvstore(path), "fill_missing_data_reads": False}
             try:
-                array = ts.open({"driver": "zarr3", "kvstore": _kvstore(path)}, open=True, read=True).result()
+                array = ts.open(spec, open=True, read=True).result()
             except ValueError as error:
                 raise ValueError(f"{path}: cannot be opened, expected an array of zarr: {error}") from error
             if array.shape != expected or array.dtype.numpy_dtype != dtype:
                 got = f"{array.dtype.name} {list(array.shape)}"
                 raise ValueError(f"{path}: got {got}, expected {np.dtype(dtype).name} {list(expected)}")
+            chunk = [n or 1 for n in array.chunk_layout.read_chunk.shape or ()]
+            if math.prod(chunk) * np.dtype(dtype).itemsize > _MAX_CHUNK_BYTES:
+                raise ValueError(f"{path}: got chunks of {chunk}, expected at most {_MAX_CHUNK_BYTES >> 20} MiB")
             self._arrays[key] = array
         return self._arrays[key]
 
@@ -266,9 +288,9 @@ def _create(path: pathlib.Path, shape: tuple[int, ...], dtype: Any) -> Any:
         "shape": list(shape),
         "data_type": np.dtype(dtype).name,
         "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": chunk}},
-        "codecs": [{"name": "bytes"}, {"name": "zstd", "configuration": {"level": 1}}],
+        "codecs": [{"name": "bytes"}, {"name": "zstd", "configuration": {"level": 1}}, {"name": "crc32c"}],
     }
-    spec = {"driver": "zarr3", "kvstore": _kvstore(path), "metadata": metadata}
+    spec = {"driver": "zarr3", "kvstore": _kvstore(path), "metadata": metadata, "store_data_equal_to_fill_value": True}
     return ts.open(spec, create=True).result()
 
 
@@ -287,19 +309,22 @@ def _read_header(folder: pathlib.Path) -> Header:
         if version != VERSION:
             raise ValueError(f"version: got {version!r}, expected {VERSION}")
         return _parse_header(values)
-    except (KeyError, TypeError, AttributeError, ValueError) as error:
+    except (KeyError, TypeError, AttributeError, ValueError, RecursionError) as error:
         raise ValueError(f"{path}: expected the header of a milx data set: {error}") from error
 
 
 def _parse_header(values: dict[str, Any]) -> Header:
     shape = values["image_shape"]
     sizes = [values["state_size"], values["action_size"], *(shape or ())]
-    if not all(isinstance(size, int) and 0 <= size < 1 << 20 for size in sizes) or (shape and len(shape) != 2):
+    whole = all(isinstance(size, int) and 0 <= size < 1 << 20 for size in sizes) and sizes[1] > 0
+    if not whole or (shape is not None and (len(shape) != 2 or 0 in shape)):
         got = f"image_shape {shape}, state_size {sizes[0]} and action_size {sizes[1]}"
-        raise ValueError(f"sizes: got {got}, expected whole numbers, two of them for images")
+        raise ValueError(f"sizes: got {got}, expected whole numbers, two of them for images; actions, too")
     tasks = []
     for i, task in enumerate(values["tasks"]):
         info = TaskInfo(task["name"], task["split"], tuple(task["lengths"]), tuple(task["has_action"]))
+        if not isinstance(info.name, str):
+            raise ValueError(f"tasks[{i}].name: got {info.name!r:.100}, expected text")
         if info.split not in SPLITS:
             raise ValueError(f"tasks[{i}].split: got {info.split!r}, expected one of {', '.join(SPLITS)}")
         if not all(isinstance(length, int) and 0 < length < 1 << 40 for length in info.lengths):

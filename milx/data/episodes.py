@@ -69,7 +69,7 @@ def run(argv: list[str], open_source: Callable[[str, Any], Source]) -> None:
     try:
         source = open_source(argv[1], FLAGS)
         write(argv[2], source.episodes(FLAGS.task), source.sizes, (FLAGS.validation, FLAGS.test), argv[1])
-    except ValueError as error:
+    except (ValueError, OSError) as error:
         sys.exit(f"milx: {error}")
     print(f"{argv[2]}: look at it with `python -m milx.data.check {argv[2]}`")
 
@@ -114,8 +114,8 @@ def split_tasks(names: list[str], validation: float, test: float) -> dict[str, s
     if (needed := 1 + (validation > 0) + (test > 0)) > len(names):
         raise ValueError(f"tasks: got {len(names)}, expected at least {needed}: one for each split")
     shuffled = sorted(names, key=lambda name: hashlib.sha256(name.encode()).digest())
-    first = max(round(validation * len(names)), validation > 0)
-    second = first + max(round(test * len(names)), test > 0)
+    second = min(max(round((validation + test) * len(names)), needed - 1), len(names) - 1)
+    first = min(max(round(validation * len(names)), validation > 0), second - (test > 0))
     of = lambda i: "validation" if i < first else "test" if i < second else "train"  # noqa: E731
     return {name: of(i) for i, name in enumerate(shuffled)}
 
@@ -128,7 +128,7 @@ def read_mapping(path: str | pathlib.Path) -> dict[str, str]:
     """
     try:
         mapping = json.loads(pathlib.Path(path).read_text())
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise ValueError(f"task: expected a JSON file at {path}: {error}") from error
     if not isinstance(mapping, dict) or not all(isinstance(task, str) for task in mapping.values()):
         raise ValueError(f"task: {path}: expected a JSON object from names of episodes to names of tasks")

@@ -25,6 +25,7 @@ from milx.data.episodes import Episode, Sizes
 from milx.types import Demo
 
 _CONVERTER = "python -m lerobot.datasets.v30.convert_dataset_v21_to_v30"
+_BATCH_BYTES = 1 << 30
 _PLACEHOLDER = re.compile(r"\{(\w+)(?::0?(\d)d)?\}")
 
 
@@ -151,7 +152,7 @@ class LeRobot:
             info = json.loads(shared.inside(self.root, "meta/info.json").read_text())
             version = str(info["codebase_version"])
             features, fps = info["features"], info["fps"]
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, RecursionError) as error:
             raise ValueError(f"{path}: expected LeRobot's metadata: {error!r}") from error
         if version.startswith("v2"):
             raise ValueError(f"{path}: codebase_version: got {version}, expected v3.0; convert it with `{_CONVERTER}`")
@@ -238,7 +239,7 @@ def _fill(template: Any, values: dict[str, Any]) -> str:
     return _PLACEHOLDER.sub(replace, str(template))
 
 
-@functools.lru_cache(maxsize=4)
+@functools.lru_cache(maxsize=2)
 def _read_table(file: pathlib.Path, columns: tuple[str, ...]) -> Any:
     """Some columns of a parquet file, of which one is "episode_index", unless they are missing or too large."""
     try:
@@ -254,7 +255,14 @@ def _read_table(file: pathlib.Path, columns: tuple[str, ...]) -> Any:
         parts = [group.column(i) for group in groups for i in range(group.num_columns)]
         wanted = [part for part in parts if part.path_in_schema.startswith(columns)]
         check_size(str(file), (sum(max(part.total_uncompressed_size, 8 * part.num_values) for part in wanted),), 1)
-        table = pyarrow.parquet.read_table(file, columns=list(columns))
+        # A value that is stored once and meant a million times is as large as a million: so few rows at once.
+        largest = max((part.total_uncompressed_size for part in wanted if part.has_dictionary_page), default=1)
+        rows, batches = min(max(_BATCH_BYTES // max(largest, 1), 1), 4096), []
+        source = pyarrow.parquet.ParquetFile(file)
+        for batch in source.iter_batches(rows, columns=list(columns)):
+            batches.append(batch)
+            check_size(str(file), (sum(each.nbytes for each in batches),), 1)
+        table = pyarrow.Table.from_batches(batches) if batches else source.read(list(columns))
         if not pyarrow.types.is_integer(numbers := table["episode_index"].type):
             raise ValueError(f"{file}: episode_index: got {numbers}, expected whole numbers")
         return table

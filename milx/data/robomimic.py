@@ -137,6 +137,8 @@ def _dataset(file: Any, name: str, axes: int) -> Any:
         raise ValueError(f"{where}: is stored outside the file, expected inside: nothing else is read")
     if found.ndim != axes or found.dtype.kind not in "fiu":
         raise ValueError(f"{where}: got {found.dtype} {list(found.shape)}, expected numbers with {axes} axes")
+    if 0 in found.shape[1:]:
+        raise ValueError(f"{where}: got shape {list(found.shape)}, expected something in every row")
     check_size(where, found.shape, found.dtype.itemsize)
     return found
 

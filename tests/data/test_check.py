@@ -90,6 +90,24 @@ def test_the_description_counts_and_measures(tmp_path):
     np.testing.assert_allclose(numbers, [column.min(), column.mean(), column.max(), column.std()], rtol=1e-3)
 
 
+def test_names_of_tasks_are_shown_as_they_are(tmp_path, capsys):
+    """Rich would take what is in brackets for its own."""
+    with Writer(tmp_path / "set", (8, 8), 2, 2) as writer:
+        for name, split in (("pick [the] cup", "train"), ("[/]", "test")):
+            writer.add(name, split, [10], [good()])
+    check.main(["check", str(tmp_path / "set")])
+    said = capsys.readouterr().out
+    assert "train: 1 tasks: pick [the] cup" in said
+    assert "task '[/]' has 1 demonstration" in " ".join(said.split())
+
+
+def test_some_task_always_trains():
+    for count in range(3, 9):
+        for validation in (0.1, 0.3, 0.4, 0.49):
+            splits = list(split_tasks([f"task {i}" for i in range(count)], validation, 0.5).values())
+            assert {"train", "validation", "test"} == set(splits), (count, validation)
+
+
 def test_splits_depend_on_names_alone_and_have_their_sizes():
     names = [f"task {i}" for i in range(50)]
     first, again = split_tasks(names, 0.1, 0.2), split_tasks(names[::-1], 0.1, 0.2)

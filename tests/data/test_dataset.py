@@ -2,11 +2,13 @@
 
 import dataclasses
 import json
+import shutil
 
 import numpy as np
 import pytest
 import zarr
 
+from milx.data import check
 from milx.data.dataset import DataSet, Writer, spread
 from milx.types import Demo
 
@@ -50,6 +52,62 @@ def test_demonstrations_come_back_bit_for_bit(written):
             np.testing.assert_array_equal(few.state, demo.state[[2, 0, 2]])
             assert few.image is None
     assert data.header.tasks[2].has_action == (True, False, True)
+
+
+def test_a_chunk_that_has_changed_or_is_missing_is_noticed(written, tmp_path):
+    folder, demos = written
+    copy = shutil.copytree(folder, tmp_path / "set")
+    chunks = sorted(path for path in copy.glob("0*/*/c/**/*") if path.is_file())
+    assert len(chunks) == 9
+    for number, path in enumerate(chunks):
+        task, field = int(path.relative_to(copy).parts[0]), path.relative_to(copy).parts[1]
+        whole = path.read_bytes()
+        for at in range(0, len(whole), max(len(whole) // 10, 1)):
+            path.write_bytes(whole[:at] + bytes([whole[at] ^ (1 << number % 8)]) + whole[at + 1 :])
+            with pytest.raises(ValueError, match="a chunk is damaged, expected what was written"):
+                DataSet(copy).read(task, 0, fields=(field,))
+        path.unlink()
+        with pytest.raises(ValueError, match="a chunk is damaged, expected what was written"):
+            DataSet(copy).read(task, 0, fields=(field,))
+        path.write_bytes(whole)
+    np.testing.assert_array_equal(DataSet(copy).read(0, 0).image, demos["lift"][0].image)
+
+
+def test_what_nobody_could_learn_from_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="action_size: got 0, expected at least 1: there is nothing to imitate"):
+        Writer(tmp_path / "set", (24, 32), 4, 0)
+    empty = pytest.raises(ValueError, match="demonstration 1 of 'lift': got no time steps, expected at least one")
+    with empty, Writer(tmp_path / "set", (24, 32), 4, 2) as writer:
+        writer.add("lift", "train", [5, 0], [random_demo(5), random_demo(0)])
+    assert not (tmp_path / "set").exists()
+
+
+def test_nothing_outside_the_folder_is_read(written, tmp_path):
+    folder, _ = written
+    copy = shutil.copytree(folder, tmp_path / "set")
+    shutil.rmtree(copy / "00000")
+    (copy / "00000").symlink_to(folder / "00000")
+    with pytest.raises(ValueError, match="00000/image: leads out of the data set's folder"):
+        DataSet(copy).read(0, 0)
+
+
+def test_what_is_too_large_is_refused_before_there_is_memory_for_it(written, tmp_path):
+    """A header that promises much, and chunks that unpack to much; neither needs a large file."""
+    folder, _ = written
+    copy = shutil.copytree(folder, tmp_path / "set")
+    header, array = copy / "zarr.json", copy / "00000" / "state" / "zarr.json"
+    values, metadata = json.loads(header.read_text()), json.loads(array.read_text())
+    values["attributes"]["milx"]["tasks"][0]["lengths"] = [10**8, 10**12]
+    metadata["shape"] = [10**8 + 10**12, 4]
+    header.write_text(json.dumps(values))
+    array.write_text(json.dumps(metadata))
+    for refused in (lambda: DataSet(copy).fingerprint(), lambda: check.vectors(DataSet(copy))):
+        with pytest.raises(ValueError, match=r"GiB, expected at most 8"):
+            refused()
+    metadata["chunk_grid"]["configuration"]["chunk_shape"] = [10**8, 4]
+    array.write_text(json.dumps(metadata))
+    with pytest.raises(ValueError, match=r"got chunks of \[100000000, 4\], expected at most 256 MiB"):
+        DataSet(copy).read(0, 0, np.zeros(1, int), fields=("state",))
 
 
 def test_zarr_alone_reads_it(written):
@@ -122,7 +180,7 @@ def test_arrays_that_do_not_fit_the_header_are_refused(written, tmp_path):
     values = json.loads((folder / "zarr.json").read_text())
     values["attributes"]["milx"]["tasks"][0]["lengths"] = [5, 10**8]
     (tmp_path / "zarr.json").write_text(json.dumps(values))
-    (tmp_path / "00000").symlink_to(folder / "00000")
+    shutil.copytree(folder / "00000", tmp_path / "00000")
     with pytest.raises(ValueError, match=r"state: got float32 \[75, 4\], expected float32 \[100000005, 4\]"):
         DataSet(tmp_path).read(0, 0, fields=("state",))
     with pytest.raises(ValueError, match=r"00001/state: cannot be opened"):

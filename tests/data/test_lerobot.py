@@ -6,10 +6,11 @@ import shutil
 import sys
 
 import numpy as np
+import pyarrow
 import pyarrow.parquet
 import pytest
 
-from milx.data import check, episodes, lerobot
+from milx.data import check, dataset, episodes, lerobot
 from milx.data.dataset import DataSet
 from milx.data.lerobot import LeRobot
 
@@ -120,6 +121,20 @@ def test_states_and_actions_may_lack():
 def test_features_that_do_not_fit_are_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         open_set(**arguments)
+
+
+def test_a_value_that_is_stored_once_and_meant_often_is_refused(copy, monkeypatch):
+    """A dictionary makes a file of some kB of what is 320 MB in memory."""
+    monkeypatch.setattr(dataset, "MAX_BYTES", 1 << 26)
+    monkeypatch.setattr(lerobot, "_BATCH_BYTES", 1 << 24)
+    path = copy / "meta/episodes/chunk-000/file-000.parquet"
+    rows = pyarrow.parquet.read_table(path).slice(0, 1).to_pylist() * 5000
+    for row in rows:
+        row["tasks"] = ["x" * (1 << 16)]
+    pyarrow.parquet.write_table(pyarrow.Table.from_pylist(rows), path)
+    assert path.stat().st_size < 1 << 18
+    with pytest.raises(ValueError, match=r"file-000\.parquet: got shape .* GiB, expected at most"):
+        open_set(copy).episodes("task_index")
 
 
 def test_older_versions_name_the_converter(copy):
