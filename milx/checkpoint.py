@@ -9,6 +9,7 @@ import hashlib
 import json
 import os
 import pathlib
+import shutil
 import sys
 import tempfile
 from collections.abc import Callable
@@ -71,7 +72,7 @@ class Checkpoints:
         Returns:
             Whether it is written.
         """
-        saves = {name: ocp.args.StandardSave(tree) for name, tree in items.items()}
+        saves = {name: ocp.args.StandardSave(jax.tree.map(_stored, tree)) for name, tree in items.items()}
         args = ocp.args.Composite(**saves, extra=ocp.args.JsonSave(extra))
         try:
             self._manager.save(step, args=args, metrics={"success": score})
@@ -80,6 +81,9 @@ class Checkpoints:
                 _write_checksums(self.folder / str(step))
         except Exception as error:  # from threads of several libraries, with types of their own
             self._manager = self._open(self.folder)
+            if self.latest == step and not _damage(self.folder / str(step)):
+                self._report(f"checkpoint of step {step}: its checksums could not be written: {error}")
+                return True
             kept = "there is none before it" if self.latest is None else f"the last good one is of step {self.latest}"
             self._report(
                 f"checkpoint of step {step} could not be written, {kept}: {str(error).strip().splitlines()[0]}"
@@ -100,7 +104,7 @@ class Checkpoints:
         Raises:
             ValueError: if it does not hold these items.
         """
-        restores = {name: ocp.args.StandardRestore(tree) for name, tree in like.items()}
+        restores = {name: ocp.args.StandardRestore(jax.tree.map(_stored, tree)) for name, tree in like.items()}
         try:
             restored = self._manager.restore(step, args=ocp.args.Composite(**restores, extra=ocp.args.JsonRestore()))
         except Exception as error:  # Orbax and tensorstore have many types
@@ -110,13 +114,28 @@ class Checkpoints:
                 f"{self.folder / str(step)}: cannot be restored, expected {expected} ({reason})"
             ) from error
         # Orbax pins arrays to the device that they come to, and a program compiled for free ones would compile again.
-        items = {name: jax.tree.map(lambda x: jnp.asarray(np.asarray(x)), restored[name]) for name in like}
-        return items, restored["extra"]
+        free = lambda like, x: jnp.asarray(np.asarray(x) if like.size else np.zeros(like.shape, like.dtype))  # noqa: E731
+        return {name: jax.tree.map(free, like[name], restored[name]) for name in like}, restored["extra"]
 
     def replace(self, step: int, items: dict[str, Any], score: float, extra: dict[str, Any]) -> bool:
-        """Writes the checkpoint of a step again, say with the score that it lacked."""
+        """Writes the checkpoint of a step again, say with the score that it lacked; a copy is kept meanwhile."""
+        old, copy = self.folder / str(step), self._replaced / str(step)
+        if parallel.is_first_host():
+            try:
+                shutil.copytree(old, copy.with_suffix(".partial"))
+                copy.with_suffix(".partial").rename(copy)
+            except OSError as error:
+                self._report(f"checkpoint of step {step} could not be written again: {error}")
+        if not parallel.on_all_hosts(copy.is_dir()):
+            return False
         self._manager.delete(step)
-        return self.save(step, items, score, extra)
+        written = self.save(step, items, score, extra)
+        if parallel.is_first_host():
+            self._put_back()
+        parallel.wait_for_all()
+        if not written:
+            self._manager = self._open(self.folder)
+        return written
 
     def score(self, step: int) -> float:
         """Of a checkpoint's validation, or UNVALIDATED."""
@@ -148,10 +167,29 @@ class Checkpoints:
         )
         return ocp.CheckpointManager(folder, options=options)
 
+    @property
+    def _replaced(self) -> pathlib.Path:
+        """Where `replace` keeps a copy."""
+        return self.folder.parent / "replaced"
+
+    def _put_back(self) -> None:
+        """Ends what `replace` began: what is not there again is put back."""
+        for copy in self._replaced.glob("*"):
+            target = self.folder / copy.name
+            if copy.suffix or (target.is_dir() and not _damage(target)):
+                shutil.rmtree(copy)
+                continue
+            if target.is_dir():
+                _move_aside(target)
+            copy.rename(target)
+
     def _without_damaged(self) -> pathlib.Path:
         """A folder with the good checkpoints alone: this one, from which the damaged are moved, or one with links."""
+        if parallel.is_first_host() and not self._read_only:
+            self._put_back()
         steps = sorted(path for path in self.folder.glob("*") if path.name.isdigit())
-        damage = {path: problem for path in steps if (problem := _damage(path))}
+        damage = {path: problem for path in steps if (problem := _damage(path)) and path.is_dir()}
+        steps = [path for path in steps if path.is_dir()]  # a trainer may remove some while others look
         for path, problem in damage.items():
             self._report(f"checkpoint {path} is damaged and not used: {problem}")
         if damage and len(damage) == len(steps):
@@ -173,6 +211,11 @@ class Checkpoints:
         return self.folder
 
 
+def _stored(x: Any) -> Any:
+    """An array as Orbax can store it, which knows none without entries."""
+    return x if np.size(x) else np.zeros(1, x.dtype)
+
+
 def _damage(checkpoint: pathlib.Path) -> str | None:
     """What is wrong with a checkpoint's files; None if nothing is."""
     path = checkpoint / _CHECKSUMS
@@ -182,9 +225,11 @@ def _damage(checkpoint: pathlib.Path) -> str | None:
         return _unreadable(checkpoint)
     try:
         expected = dict(json.loads(path.read_text()))
-    except ValueError:
-        return f"{_CHECKSUMS} is no JSON"
-    found = _checksums(checkpoint)
+        found = _checksums(checkpoint)
+    except FileNotFoundError as error:
+        return f"{error.filename} has vanished"
+    except (ValueError, TypeError, RecursionError):
+        return f"{_CHECKSUMS} holds no checksums"
     for name in sorted(expected):
         if name not in found:
             return f"{name} is missing"
@@ -194,7 +239,12 @@ def _damage(checkpoint: pathlib.Path) -> str | None:
 
 
 def _unreadable(checkpoint: pathlib.Path) -> str | None:
-    """What keeps the arrays of a checkpoint without checksums from being read; None if nothing does."""
+    """What keeps a checkpoint without checksums from being read; None if nothing does."""
+    for path in (checkpoint / "metrics" / "metrics", checkpoint / "extra" / "metadata"):
+        try:
+            json.loads(path.read_text())
+        except (OSError, ValueError, RecursionError) as error:
+            return f"{path.relative_to(checkpoint)} cannot be read ({type(error).__name__})"
     with contextlib.closing(ocp.StandardCheckpointer()) as reader:
         for item in sorted(path.parent for path in checkpoint.glob("*/manifest.ocdbt")):
             try:

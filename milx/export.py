@@ -15,15 +15,17 @@ import sys
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from absl import app, flags, logging
 from jax import export as jax_export
 
 from milx import envs, exported
 from milx.config import GIVEN
+from milx.methods import Spec
 from milx.policy import Policy, with_goals
 from milx.pretrained import load
-from milx.types import Demo, Observation
+from milx.types import Demo, Observation, Params
 
 PLATFORMS = ("cpu", "cuda")
 
@@ -45,21 +47,24 @@ def export(policy: Policy, out: str | pathlib.Path, shots: int = 1) -> None:
     sizes = input_shapes(policy, shots)
     leaves, structure = jax.tree.flatten(policy.params)
 
+    def learn(params: Params, demo: dict[str, jax.Array]) -> Params:
+        return policy.method.adapt(params, with_goals(Demo(**_with_state(demo, policy.spec)), policy.spec))
+
     def adapt(leaves: list[jax.Array], demo: dict[str, jax.Array]) -> list[jax.Array]:
-        params = jax.tree.unflatten(structure, leaves)
-        return jax.tree.leaves(policy.method.adapt(params, with_goals(Demo(**demo), policy.spec)))
+        return jax.tree.leaves(learn(jax.tree.unflatten(structure, leaves), demo))
 
     shapes = {
         name: {field: jax.ShapeDtypeStruct(tuple(shape), _dtype(field)) for field, shape in fields.items()}
         for name, fields in sizes.items()
     }
-    task_params = jax.eval_shape(
-        lambda demo: policy.method.adapt(policy.params, with_goals(Demo(**demo), policy.spec)), shapes["adapt"]
-    )
+    task_params = jax.eval_shape(learn, policy.params, shapes["adapt"])
     task_structure = jax.tree.structure(task_params)
 
+    def seen(observation: dict[str, jax.Array]) -> Observation:
+        return Observation(**_with_state(observation, policy.spec))
+
     def act(leaves: list[jax.Array], observation: dict[str, jax.Array]) -> jax.Array:
-        return policy.method.act(jax.tree.unflatten(task_structure, leaves), Observation(**observation), ())[0]
+        return policy.method.act(jax.tree.unflatten(task_structure, leaves), seen(observation), ())[0]
 
     programs = {
         "adapt": _program(adapt, leaves, shapes["adapt"]),
@@ -81,13 +86,18 @@ def input_shapes(policy: Policy, shots: int) -> dict[str, dict[str, list[int]]]:
     """Shapes of the fields that "adapt" and "act" take."""
     spec, config = policy.spec, policy.config
     horizon = config.recorded.horizon if config.recorded.path else envs.ENVS[config.env_name].horizon
-    seen = {"state": [spec.state_size]}
+    seen = {"state": [spec.state_size]} if spec.state_size else {}
     if spec.image_shape is not None:
         seen["image"] = [*spec.image_shape, 3]
     shown = seen | {"action": [spec.action_size]}
     hidden = {GIVEN[0]: (), GIVEN[1]: ("action",), GIVEN[2]: ("action", "state")}[config.mil.given]
     adapt = {name: [shots, horizon, *shape] for name, shape in shown.items() if name not in hidden}
     return {"adapt": adapt, "act": seen}
+
+
+def _with_state(fields: dict[str, jax.Array], spec: Spec) -> dict[str, jax.Array]:
+    """What is shown, with an empty state where there are no states."""
+    return fields if spec.state_size else {**fields, "state": jnp.zeros((*fields["image"].shape[:-3], 0))}
 
 
 def _dtype(field: str) -> Any:

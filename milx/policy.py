@@ -140,7 +140,7 @@ def check_demo(demo: Demo, spec: Spec, given: str = GIVEN[0]) -> Demo:
     shape = first.shape[: lead + 1]
     checked = Demo(_check_image("demo.image", demo.image, shape, spec))
     if given != "video":
-        state = _check_vector("demo.state", demo.state, (*shape, spec.state_size))
+        state = _check_state("demo.state", demo.state, shape, spec)
         checked = dataclasses.replace(checked, state=state)
     if given == "video+state+action":
         checked = dataclasses.replace(checked, action=_check_action(demo.action, shape, spec))
@@ -179,7 +179,7 @@ def check_observation(observation: Observation, spec: Spec) -> Observation:
         raise ValueError(f"observation: got {type(observation).__name__}, expected a milx.Observation")
     return Observation(
         image=_check_image("observation.image", observation.image, (), spec),
-        state=_check_vector("observation.state", observation.state, (spec.state_size,)),
+        state=_check_state("observation.state", observation.state, (), spec),
     )
 
 
@@ -201,6 +201,13 @@ def _check_image(field: str, value: Any, lead: tuple[int, ...], spec: Spec) -> j
     if array.dtype != np.uint8:
         raise ValueError(f"{field}: got {array.dtype}, expected uint8 in [0, 255]")
     return array
+
+
+def _check_state(field: str, value: Any, lead: tuple[int, ...], spec: Spec) -> np.ndarray:
+    """The state; where there are no states, none is asked for."""
+    if value is None and not spec.state_size:
+        return np.zeros((*lead, 0), np.float32)
+    return _check_vector(field, value, (*lead, spec.state_size))
 
 
 def _check_vector(field: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:

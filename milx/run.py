@@ -54,6 +54,10 @@ class Training(NamedTuple):
     first_images: Callable[[], np.ndarray]
 
 
+MOST_IN_VAIN = 100
+"""Updates in a row that are not finite, after which a run stops (at the end of the scan)."""
+
+
 def check_steps(config: Config) -> None:
     """Raises ValueError unless training and validation come after whole numbers of scans."""
     for name in ("steps", "eval_every"):
@@ -189,39 +193,50 @@ class Run(abc.ABC):
             extra["versions"] = provenance.versions(("milx", "jax", "orbax-checkpoint"))
             return write(int(state.step), items, score if np.isfinite(score) else UNVALIDATED, extra)
 
-        def validate_now(state: TrainState) -> float:
+        def validate(state: TrainState) -> bool:
+            """Gives a checkpoint its score; a signal meanwhile loses nothing but that."""
             with self._clock("evaluate"):
                 score = self._validate(state.params)
             metrics.write(int(state.step), {f"validation_{self.metric}": score})
             self.console.print(f"step {int(state.step)}: validation {self.metric} {score:.1%}")
-            return score
+            with stop.deferred():
+                return save(state, score, checkpoints.replace)
 
-        due = step % config.eval_every == 0 or step == config.steps
-        if step and due and checkpoints.score(step) == UNVALIDATED:  # there was no time for it
-            written = save(state, validate_now(state), checkpoints.replace)
-        with stop.deferred(), self._progress(config.steps) as progress:
+        def is_due(step: int) -> bool:
+            return step % config.eval_every == 0 or step >= config.steps
+
+        if step and is_due(step) and checkpoints.score(step) == UNVALIDATED:  # there was no time for it
+            written = validate(state)
+        with self._progress(config.steps) as progress:
             bar = progress.add_task(
                 "meta-train", total=config.steps, completed=int(state.step), loss=float("nan"), rate=0
             )
-            while step < config.steps and not parallel.on_any_host(stop.asked):
-                began = time.perf_counter()
-                with self._clock("train"):
-                    state, values = run_steps(state, training.at(step), key)
-                    values = {name: float(value) for name, value in values.items()}
-                rate = config.log_every / (time.perf_counter() - began)
-                step += config.log_every
-                metrics.write(step, {**values, "steps_per_s": rate})
-                progress.update(bar, completed=step, loss=values["loss"], rate=rate)
-                if values["skipped"]:
-                    self._warn(_describe_skipped(values, step))
-                if values["skipped"] == config.log_every:
-                    last = f"the last good checkpoint is of step {checkpoints.latest}"
-                    raise ValueError(f"train: no update of the last {config.log_every} was finite; {last}")
-                stopping = parallel.on_any_host(stop.asked)
-                if step % config.eval_every == 0 or step >= config.steps or stopping:
-                    score = UNVALIDATED if stopping else validate_now(state)
-                    written = save(state, score, checkpoints.save)
-            stopping = parallel.on_any_host(stop.asked)
+            stopping, in_vain = False, 0
+            while step < config.steps and not stopping:
+                with stop.deferred():
+                    began = time.perf_counter()
+                    with self._clock("train"):
+                        state, values = run_steps(state, training.at(step), key)
+                        values = {name: float(value) for name, value in values.items()}
+                    rate = config.log_every / (time.perf_counter() - began)
+                    step += config.log_every
+                    metrics.write(step, {**values, "steps_per_s": rate})
+                    progress.update(bar, completed=step, loss=values["loss"], rate=rate)
+                    if values["skipped"]:
+                        self._warn(_describe_skipped(values, step))
+                    in_vain = in_vain + config.log_every if values["skipped"] == config.log_every else 0
+                    if in_vain >= MOST_IN_VAIN:
+                        last = "there is no checkpoint"
+                        if checkpoints.latest is not None:
+                            last = f"the last good checkpoint is of step {checkpoints.latest}"
+                        raise ValueError(f"train: no update of the last {in_vain} was finite; {last}")
+                    stopping = parallel.on_any_host(stop.asked)
+                    if is_due(step) or stopping:
+                        written = save(state, UNVALIDATED, checkpoints.save)
+                if is_due(step):  # all there is has been saved
+                    stopping = parallel.on_any_host(stop.asked)
+                    if written and not stopping:
+                        written = validate(state)
         metrics.close()
         latest = checkpoints.latest
         checkpoints.close()

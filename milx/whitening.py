@@ -1,6 +1,7 @@
 """Whitening of states and actions with statistics of the training tasks only."""
 
 import dataclasses
+import math
 
 import jax
 import jax.numpy as jnp
@@ -48,7 +49,7 @@ def fit(state: jax.Array, action: jax.Array, whiten_actions: bool) -> Whitening:
     """
 
     def moments(x: jax.Array) -> tuple[jax.Array, jax.Array]:
-        x = x.reshape(-1, x.shape[-1])
+        x = x.reshape(math.prod(x.shape[:-1]), x.shape[-1])  # which may be 0
         return x.mean(axis=0), jnp.maximum(x.std(axis=0), MIN_STD)
 
     action_mean, action_scale = moments(action)

@@ -119,13 +119,13 @@ def test_a_full_disk_keeps_the_last_good_checkpoint_and_says_so(folder, tmp_path
     assert Checkpoints(mine, read_only=True).latest == 30
 
 
+def full(*args, **kwargs):
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
 def test_an_error_of_the_disk_is_reported_with_its_reason(folder, tmp_path, monkeypatch):
     reports = []
     checkpoints = Checkpoints(copy(folder, tmp_path / "checkpoints"), report=reports.append)
-
-    def full(*args, **kwargs):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
     monkeypatch.setattr(checkpoints._manager, "save", full)
     assert not checkpoints.save(30, items(30), 0.9, {})
     assert "No space left on device" in reports[0]
@@ -183,3 +183,55 @@ def test_the_best_is_kept_and_one_that_nobody_validated_is_the_best_only_if_alon
 def test_checksums_name_every_file(folder):
     names = json.loads((folder / "20" / "checksums.json").read_text())
     assert sorted(names) == [str(name.relative_to("20")) for name in files(folder) if name.name != "checksums.json"]
+
+
+def test_a_checkpoint_that_is_written_again_is_never_lost(tmp_path, monkeypatch):
+    """Killed before the new one is there, or without room for it: the old one is there."""
+    folder, reports = written(tmp_path / "checkpoints", [UNVALIDATED]), []
+    checkpoints = Checkpoints(folder, report=reports.append)
+
+    def killed(*args, **kwargs):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoints, "save", killed)
+        with pytest.raises(KeyboardInterrupt):
+            checkpoints.replace(10, items(10), 0.5, {"number": 1})
+    assert not (folder / "10").exists()
+    checkpoints = Checkpoints(folder, report=reports.append)
+    assert restored(checkpoints, checkpoints.latest) == {"number": 0}
+
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoints._manager, "save", full)
+        assert not checkpoints.replace(10, items(10), 0.5, {"number": 1})
+    assert restored(checkpoints, checkpoints.latest) == {"number": 0}
+    assert checkpoints.replace(10, items(10), 0.5, {"number": 2})
+    assert restored(checkpoints, checkpoints.latest) == {"number": 2}
+    assert checkpoints.score(10) == 0.5
+    assert list((tmp_path / "replaced").iterdir()) == []
+    checkpoints.close()
+
+
+def test_without_checksums_every_file_counts(folder, tmp_path):
+    for i, name in enumerate(("metrics/metrics", "extra/metadata")):
+        mine, reports = copy(folder, tmp_path / str(i) / "checkpoints"), []
+        (mine / "20" / "checksums.json").unlink()
+        DAMAGES["truncated"](mine / "20" / name)
+        assert Checkpoints(mine, read_only=True, report=reports.append).latest == 10
+        assert name in reports[0]
+    mine = copy(folder, tmp_path / "none" / "checkpoints")
+    for text in ("null", "[1]", "{"):
+        (mine / "20" / "checksums.json").write_text(text)
+        reports = []
+        assert Checkpoints(mine, read_only=True, report=reports.append).latest == 10
+        assert "checksums.json holds no checksums" in reports[0]
+
+
+def test_arrays_without_entries_come_back(tmp_path):
+    checkpoints = Checkpoints(tmp_path / "checkpoints")
+    tree = {"params": {"empty": jnp.zeros((0, 3), jnp.int32), "full": jnp.arange(4.0)}}
+    assert checkpoints.save(10, tree, 0.5, {})
+    found, _ = checkpoints.restore(10, tree)
+    jax.tree.map(np.testing.assert_array_equal, found, tree)
+    assert found["params"]["empty"].shape == (0, 3)
+    checkpoints.close()

@@ -13,9 +13,10 @@ from rich.console import Console
 from tiny import QUIET
 
 import milx
-from milx import guard, recording, runs
+from milx import exported, guard, recording, runs
 from milx.checkpoint import UNVALIDATED, Checkpoints
 from milx.data.dataset import DataSet, Writer
+from milx.export import export
 from milx.methods.maml import MIL
 from milx.metrics import MetricsWriter
 from milx.recording import RecordedRun
@@ -158,8 +159,8 @@ def test_an_interrupted_run_ends_bit_for_bit_like_the_uninterrupted_one(trained,
     for name in ("stopped", "terminated"):
         folder = tmp_path / name / "checkpoints"
         before = Checkpoints(folder, read_only=True)
-        assert before.latest == 100
-        assert (before.score(100) == UNVALIDATED) == (name == "terminated")
+        assert before.latest == {"stopped": 200, "terminated": 100}[name]
+        assert before.score(before.latest) == UNVALIDATED
         jax.tree.map(np.testing.assert_array_equal, final(tmp_path / name), straight)
         after = Checkpoints(folder, read_only=True)
         assert (after.latest, after.best) == (200, best)
@@ -218,10 +219,49 @@ def test_updates_that_are_not_finite_are_skipped_counted_and_named(folder, tmp_p
 
 def test_a_run_without_a_finite_update_stops(folder, tmp_path, monkeypatch):
     run, _ = run_with_losses(folder, tmp_path, monkeypatch, lambda n: jnp.inf * jnp.ones_like(n, jnp.float32))
-    with pytest.raises(
-        ValueError, match="no update of the last 20 was finite; the last good checkpoint is of step None"
-    ):
+    monkeypatch.setattr("milx.run.MOST_IN_VAIN", 30)  # after two scans of 20
+    with pytest.raises(ValueError, match="no update of the last 40 was finite; there is no checkpoint"):
         run.train()
+
+
+def test_where_there_are_no_states_none_are_needed(tmp_path):
+    """From the data set to the exported policy, which is that of `milx.load`."""
+    rng = np.random.default_rng(0)
+    with Writer(tmp_path / "set", (12, 16), 0, 2, "a test") as writer:
+        for task, split in enumerate(("train", "train", "validation", "test")):
+            demos = [dataclasses.replace(random_demo(rng, np.ones(2), HORIZON), state=None) for _ in range(2)]
+            writer.add(f"task {task}", split, [HORIZON] * 2, demos)
+    config = tiny_config(tmp_path / "set")
+    config.train.steps = config.train.log_every = config.train.eval_every = config.train.meta_batch = 2
+    run = runs.make(config, tmp_path / "run", QUIET)
+    run.train()
+    assert np.isfinite(run.evaluate()["action_error"]["after"])
+    policy, demo = milx.load(tmp_path / "run"), demos[0]
+    task_params = policy.adapt(policy.params, demo)
+    action = policy.act(task_params, milx.Observation(demo.image[0], None))
+    export(policy, tmp_path / "out")
+    alone = exported.Policy(tmp_path / "out")
+    assert alone.sizes["act"] == {"image": [12, 16, 3]}
+    found = alone.act(alone.adapt(image=demo.image, action=demo.action), image=demo.image[0])
+    np.testing.assert_allclose(found, action, atol=1e-5)
+
+
+def test_what_may_be_shown_without_actions_is_not_what_is_asked_for(tmp_path):
+    """One of three demonstrations shows actions: it is the query, whether it comes first or last."""
+    rng = np.random.default_rng(0)
+    for place in range(3):
+        folder = tmp_path / f"set {place}"
+        with Writer(folder, (12, 16), 3, 2, "a test") as writer:
+            for split in ("train", "validation", "test"):
+                demos = [random_demo(rng, np.ones(2), HORIZON) for _ in range(3)]
+                demos = [demo if i == place else dataclasses.replace(demo, action=None) for i, demo in enumerate(demos)]
+                writer.add(split, split, [HORIZON] * 3, demos)
+        config = tiny_config(folder)
+        config.mil.given, config.network.learned_loss = "video+state", "linear"
+        queries, support = runs.make(config, tmp_path / f"run {place}", QUIET)._task(1, 2)
+        assert queries.acts.tolist() == [True] + [False] * (len(queries.acts) - 1)
+        np.testing.assert_array_equal(queries.demo.action[0], DataSet(folder).read(1, place).action)
+        assert not any((shown == queries.demo.state[0]).all() for shown in support.state)
 
 
 def test_data_that_are_not_finite_are_refused_by_name(tmp_path):

@@ -65,8 +65,8 @@ def test_interrupted_run_ends_bit_for_bit_like_the_uninterrupted_one(trained, tm
         patch.setattr(MetricsWriter, "write", interrupt)
         with pytest.raises(StoppedError):
             same_run(trained, tmp_path).train()
-    # The checkpoint of step 2 is there, the loss of step 4 is already in the file.
-    assert Checkpoints(tmp_path / "checkpoints", read_only=True).latest == 2
+    # The checkpoint of step 4 is there, without its score, and the loss of step 4 is already in the file.
+    assert Checkpoints(tmp_path / "checkpoints", read_only=True).latest == 4
     assert [json.loads(line)["step"] for line in (tmp_path / "metrics.jsonl").open()] == [2, 2, 4]
 
     written = []
@@ -75,7 +75,7 @@ def test_interrupted_run_ends_bit_for_bit_like_the_uninterrupted_one(trained, tm
     )
     resumed = same_run(trained, tmp_path)
     resumed.train()
-    assert written == [4, 4, 6, 6], "it continues from the checkpoint"
+    assert written == [4, 6, 6], "it continues from the checkpoint, which it validates first"
 
     (expected, last), (found, found_last) = final_items(trained.run), final_items(resumed)
     assert found_last == last == 6

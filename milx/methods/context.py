@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from milx.config import MILConfig
 from milx.methods.base import Method
-from milx.methods.imitation import behavioural_cloning, calibrate_goal_head, shown
+from milx.methods.imitation import behavioural_cloning, calibrate_goal_head, flat, shown
 from milx.networks.context import ContextNetwork
 from milx.types import Demo, Memory, Observation, Params, TaskBatch
 from milx.whitening import Whitening
@@ -55,10 +55,10 @@ class ContextPolicy(Method):
         def task_loss(support: Demo, query: Demo) -> tuple[jax.Array, dict[str, jax.Array]]:
             task_params = self.adapt(params, support)
             whitening = jax.lax.stop_gradient(params["whitening"])
-            flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), query)
+            seen = flat(query)
 
             def one(context: Any) -> tuple[jax.Array, dict[str, jax.Array]]:
-                output = self.network.apply(task_params, context, flat.image, whitening.state(flat.state))
+                output = self.network.apply(task_params, context, seen.image, whitening.state(seen.state))
                 return behavioural_cloning(self.config, output, output.action, query, whitening, self.goal_indices)
 
             return jax.tree.map(jnp.mean, jax.vmap(one)(task_params["context"]))

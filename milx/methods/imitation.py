@@ -24,6 +24,11 @@ def shown(demo: Demo, given: str, whitening: Whitening) -> Demo:
     return dataclasses.replace(demo, state=state, action=action, goal=None)
 
 
+def flat(demo: Demo) -> Demo:
+    """All time steps of demonstrations [K, T, ...], one after the other."""
+    return jax.tree.map(lambda x: x.reshape(x.shape[0] * x.shape[1], *x.shape[2:]), demo)
+
+
 def behavioural_cloning(
     config: MILConfig,
     output: PolicyOutput,

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 
 from milx.config import GIVEN, MILConfig
 from milx.methods.base import Method
-from milx.methods.imitation import behavioural_cloning, calibrate_goal_head, goal_loss, shown
+from milx.methods.imitation import behavioural_cloning, calibrate_goal_head, flat, goal_loss, shown
 from milx.networks.policy import PolicyNetwork, PolicyOutput
 from milx.types import Demo, Memory, Observation, Params, TaskBatch
 from milx.whitening import Whitening
@@ -142,8 +142,8 @@ class MIL(Method):
 
     def _apply(self, theta: Params, whitening: Whitening, demo: Demo) -> PolicyOutput:
         """What the network says of all time steps of demonstrations [K, T, ...], one after the other."""
-        flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), demo)
-        return self.network.apply(theta, flat.image, whitening.state(flat.state))
+        seen = flat(demo)
+        return self.network.apply(theta, seen.image, whitening.state(seen.state))
 
     def imitation_loss(
         self, theta: Params, whitening: Whitening, demo: Demo, inner: bool = False
