@@ -11,6 +11,7 @@ import hashlib
 import json
 import pathlib
 import random
+import re
 import signal
 import subprocess
 import sys
@@ -122,8 +123,10 @@ def terminate(data: pathlib.Path, workdir: pathlib.Path, rng: random.Random, lon
     alive, began = process.poll() is None, time.monotonic()
     process.send_signal(signal.SIGTERM)
     out, _ = process.communicate()
-    said = "the same command" in out
-    return {"sent": alive, "seconds": round(time.monotonic() - began, 2), "code": process.returncode, "said_how": said}
+    said = re.search(r"stopped(?: at step (\d+))?; the same command goes on", out)
+    saved = said is None or said[1] is None or last_step(workdir) == int(said[1])  # before the first update: nothing
+    found = {"sent": alive, "seconds": round(time.monotonic() - began, 2), "code": process.returncode}
+    return found | {"said_how": said is not None, "saved": saved, "to_step": last_step(workdir)}
 
 
 def main(_: list[str]) -> None:
@@ -154,7 +157,11 @@ def main(_: list[str]) -> None:
             found = terminate(folder / "data", workdir, rng, 0.7 * longest)
             if found["sent"]:
                 found["same"] = finish(folder / "data", workdir) == expected
-                if found["seconds"] > 10 or found["code"] or not found["said_how"] or not found["same"]:
+                if (
+                    found["seconds"] > 10
+                    or found["code"]
+                    or not (found["said_how"] and found["saved"] and found["same"])
+                ):
                     raise RuntimeError(f"SIGTERM: {found}")
                 terms.append(found)
                 print(found, flush=True)

@@ -57,13 +57,16 @@ print(json.dumps([ready, np.median([timed(adapt) for _ in range(5)]), np.median(
 """
 
 
-def write_lerobot(root: pathlib.Path) -> None:
+CODECS = {"AV1, as LeRobot writes": "libsvtav1", "H.264": "h264"}
+
+
+def write_lerobot(root: pathlib.Path, codec: str) -> None:
     """A set in LeRobot's layout, version 3: one video, of moving squares on noise, and one table."""
     rng, count = np.random.default_rng(0), TASKS * EPISODES
     video = root / "videos/observation.images.top/chunk-000/file-000.mp4"
     video.parent.mkdir(parents=True)
     with av.open(str(video), "w") as container:
-        stream = container.add_stream("h264", rate=FPS, options={"g": "2", "crf": "30"})
+        stream = container.add_stream(codec, rate=FPS, options={"g": "2", "crf": "30"})
         stream.width = stream.height = SIZE
         stream.pix_fmt = "yuv420p"
         background = rng.integers(0, 256, (16, 16, 3), np.uint8).repeat(8, axis=0).repeat(8, axis=1)
@@ -104,13 +107,16 @@ def write_lerobot(root: pathlib.Path) -> None:
 
 
 def measure_import(folder: pathlib.Path, report: common.Report) -> None:
-    """Rows of importing a set."""
-    write_lerobot(folder / "lerobot")
-    began = time.perf_counter()
-    source = LeRobot(folder / "lerobot", None, "observation.state", "action", SIZE)
-    episodes.write(folder / "set", source.episodes("task_index"), source.sizes, (0.1, 0.1), "benchmark")
-    rate = TASKS * EPISODES * FRAMES / (time.perf_counter() - began)
-    report.add("LeRobot import", rate, "frames/s", note=f"{TASKS} x {EPISODES} x {FRAMES} frames of {SIZE}x{SIZE}")
+    """Rows of importing a set, by codec."""
+    for name, codec in CODECS.items():
+        root, out = folder / f"lerobot-{codec}", folder / f"set-{codec}"
+        write_lerobot(root, codec)
+        began = time.perf_counter()
+        source = LeRobot(root, None, "observation.state", "action", SIZE)
+        episodes.write(out, source.episodes("task_index"), source.sizes, (0.1, 0.1), "benchmark")
+        rate = TASKS * EPISODES * FRAMES / (time.perf_counter() - began)
+        note = f"{TASKS} x {EPISODES} x {FRAMES} frames of {SIZE}x{SIZE}"
+        report.add(f"LeRobot import, {name}", rate, "frames/s", note=note)
 
 
 def measure_export(preset: str, folder: pathlib.Path, report: common.Report) -> None:

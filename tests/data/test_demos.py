@@ -67,6 +67,19 @@ def test_file_that_does_not_fit_is_refused(file, like, tmp_path, name, change, m
     assert str(error.value) == f"{path}: {message}"
 
 
+class Payload:
+    """What runs code when it is unpickled."""
+
+    def __reduce__(self):
+        return exec, ("raise __import__('os').error('executed')",)
+
+
+def test_a_pickle_is_refused_and_not_executed(tmp_path):
+    np.savez(tmp_path / "file.npz", a=np.array([Payload()], object))
+    with pytest.raises(ValueError, match="allow_pickle=False"):
+        pytrees.load(tmp_path / "file.npz", {"a": jnp.zeros(1)})
+
+
 def test_fingerprint_sees_every_number(trained):
     original = pytrees.fingerprint(trained.train)
     leaves, structure = jax.tree.flatten(trained.train)
