@@ -185,8 +185,10 @@ class Checkpoints:
 
     def _without_damaged(self) -> pathlib.Path:
         """A folder with the good checkpoints alone: this one, from which the damaged are moved, or one with links."""
-        if parallel.is_first_host() and not self._read_only:
-            self._put_back()
+        if not self._read_only:
+            if parallel.is_first_host():
+                self._put_back()
+            parallel.wait_for_all()
         steps = sorted(path for path in self.folder.glob("*") if path.name.isdigit())
         damage = {path: problem for path in steps if (problem := _damage(path)) and path.is_dir()}
         steps = [path for path in steps if path.is_dir()]  # a trainer may remove some while others look
