@@ -119,14 +119,18 @@ class Checkpoints:
 
     def replace(self, step: int, items: dict[str, Any], score: float, extra: dict[str, Any]) -> bool:
         """Writes the checkpoint of a step again, say with the score that it lacked; a copy is kept meanwhile."""
-        old, copy = self.folder / str(step), self._replaced / str(step)
+        copied = True
         if parallel.is_first_host():
+            copy = self._replaced / str(step)
+            partial = copy.with_suffix(".partial")
             try:
-                shutil.copytree(old, copy.with_suffix(".partial"))
-                copy.with_suffix(".partial").rename(copy)
+                shutil.rmtree(partial, ignore_errors=True)
+                shutil.copytree(self.folder / str(step), partial)
+                partial.rename(copy)
             except OSError as error:
+                copied = False
                 self._report(f"checkpoint of step {step} could not be written again: {error}")
-        if not parallel.on_all_hosts(copy.is_dir()):
+        if not parallel.on_all_hosts(copied):
             return False
         self._manager.delete(step)
         written = self.save(step, items, score, extra)
