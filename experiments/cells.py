@@ -22,9 +22,9 @@ from milx.data import demos as demos_lib
 from milx.data.demos import DemoSet
 from milx.policy import spec_of
 from milx.presets import make_config
-from milx.run import check_steps, initial_state
 from milx.simulation import split_demos, training_on, trial_key
 from milx.trainer import Trainer, make_optimizer
+from milx.training import check_steps, initial_state
 from milx.types import Params
 
 METHODS = {

@@ -20,7 +20,8 @@ from milx.data.dataset import DataSet, spread
 from milx.data.recorded import MOST_DEMOS, Recorded, Shards, load, sample_batch, with_goals
 from milx.methods import Method, Spec
 from milx.policy import SPEC_FILE
-from milx.run import Run, Training
+from milx.run import Run
+from milx.training import Training
 from milx.types import Demo, Observation, Params, TaskBatch
 
 RECORDED = "recorded"

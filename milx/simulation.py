@@ -20,7 +20,8 @@ from milx.envs.base import State
 from milx.evaluator import Trials
 from milx.methods.random import Random
 from milx.policy import spec_of
-from milx.run import Run, Training
+from milx.run import Run
+from milx.training import Training
 from milx.types import Params
 
 EVALUATION_SEED = 2017

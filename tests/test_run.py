@@ -17,8 +17,8 @@ from milx.checkpoint import Checkpoints
 from milx.metrics import MetricsWriter
 from milx.networks import fixed
 from milx.policy import params_like, spec_of
-from milx.run import initial_state
 from milx.simulation import SimulatedRun, training_on
+from milx.training import initial_state
 
 RESULT_FIELDS = {
     *("env", "method", "preset", "variant", "seed", "num_tasks_train", "num_demos_train", "shots", "given"),

@@ -1,0 +1,50 @@
+"""What training starts from: data with their statistics, and the first parameters."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from milx.config import Config
+from milx.networks import fixed
+from milx.trainer import Trainer, TrainState
+from milx.whitening import Whitening
+
+
+class Training(NamedTuple):
+    """What a run trains on.
+
+    Attributes:
+        dataset_hash: of the training demonstrations.
+        whitening: their statistics.
+        at: the data from which the scan that begins at a step draws its batches.
+        first_images: [N, H, W, 3] uint8, what some of the demonstrations show first.
+    """
+
+    dataset_hash: str
+    whitening: Whitening
+    at: Callable[[int], Any]
+    first_images: Callable[[], np.ndarray]
+
+
+def check_steps(config: Config) -> None:
+    """Raises ValueError unless training and validation come after whole numbers of scans."""
+    for name in ("steps", "eval_every"):
+        value, scan = getattr(config.train, name), config.train.log_every
+        if value < 1 or value % scan:
+            raise ValueError(f"train.{name}: got {value}, expected a positive multiple of train.log_every = {scan}")
+
+
+def initial_state(trainer: Trainer, config: Config, training: Training) -> tuple[TrainState, jax.Array]:
+    """The state before the first meta-update on these demonstrations, and the key of the batches."""
+    init_key, batch_key = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), 3))
+    state = trainer.init(init_key, training.whitening)
+    if config.network.fixed_filters is None:
+        return state, batch_key
+    if config.network.fixed_filters == fixed.KMEANS:
+        filters = fixed.cluster(training.first_images(), config.network)
+    else:
+        filters = fixed.load(config.network.fixed_filters, config.network)
+    return dataclasses.replace(state, params=fixed.put(state.params, filters)), batch_key
