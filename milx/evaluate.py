@@ -27,7 +27,7 @@ def main(argv: list[str]) -> None:
     try:
         run = runs.make(config_lib.read(path), path.parent)
         run.report(run.evaluate())
-    except ValueError as error:
+    except (ValueError, OSError) as error:
         sys.exit(f"milx: {error}")
 
 

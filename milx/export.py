@@ -116,7 +116,7 @@ def main(argv: list[str]) -> None:
     logging.set_verbosity(logging.WARNING)
     try:
         export(load(argv[1]), argv[2], flags.FLAGS.shots)
-    except ValueError as error:
+    except (ValueError, OSError) as error:
         sys.exit(f"milx: {error}")
     size = sum(path.stat().st_size for path in pathlib.Path(argv[2]).iterdir())
     print(f"{argv[2]}: {size / 1e6:.1f} MB; `from policy import Policy` there")

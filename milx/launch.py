@@ -85,7 +85,7 @@ def parse(argv: Sequence[str], values: flags.FlagValues = FLAGS) -> list[str]:
             config = presets.make_config(values.env, values.method, preset, values.seed)
         else:
             config = recording.make_config(values.data, values.method, preset, values.seed)
-    except ValueError as error:
+    except (ValueError, OSError) as error:
         raise flags.Error(str(error)) from error
     _check_fields(argv, config)
     unset = [arg for arg in argv if arg.startswith("--config.") and arg.endswith("=None")]
