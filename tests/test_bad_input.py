@@ -87,8 +87,9 @@ def almost_good_demos(draw):
     length = draw(st.sampled_from([1, 2, 6, 10**6]))
     fields = {"image": (np.uint8, (4, 5, 3)), "state": (np.float32, (3,)), "action": (np.float64, (2,))}
     arrays = {name: np.broadcast_to(dtype(1), (length, *shape)) for name, (dtype, shape) in fields.items()}
-    if draw(st.booleans()):
-        arrays[draw(st.sampled_from(sorted(arrays)))] = draw(ARRAYS)
+    changed = draw(st.sampled_from([None, None, *arrays]))
+    if changed is not None:
+        arrays[changed] = draw(ARRAYS)
     return Demo(**arrays)
 
 
@@ -110,7 +111,7 @@ def test_demos():
         assert checked.action is None or (np.abs(checked.action) <= [1, 2]).all()
 
     check()
-    assert all(good.count(shown) > 10 for shown in GIVEN)
+    assert all(good.count(shown) > 3 for shown in GIVEN)
 
 
 @cases("observations")
