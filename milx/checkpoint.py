@@ -186,6 +186,8 @@ class Checkpoints:
             if target.is_dir():
                 _move_aside(target)
             copy.rename(target)
+        with contextlib.suppress(OSError):  # there is none, or not for us to remove
+            self._replaced.rmdir()
 
     def _without_damaged(self) -> pathlib.Path:
         """A folder with the good checkpoints alone: this one, from which the damaged are moved, or one with links."""
