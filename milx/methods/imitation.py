@@ -50,15 +50,15 @@ def behavioural_cloning(
     Returns:
         The sum, and its parts.
     """
-    shown = demo.action.reshape(-1, demo.action.shape[-1])
-    error = config.loss_scale * (action - whitening.action(shown))
+    seen = flat(demo)
+    error = config.loss_scale * (action - whitening.action(seen.action))
     loss = action_loss = jnp.mean(jnp.square(error))
     metrics = {"action_loss": action_loss}
     if output.goal is not None and demo.goal is not None:
         metrics["goal_loss"] = goal_loss(output.goal, demo.goal, whitening, goal_indices)
         loss += config.goal_weight * metrics["goal_loss"]
     if output.robot is not None:
-        where = whitening.state(demo.state.reshape(-1, demo.state.shape[-1]))[:, jnp.array(goal_indices)]
+        where = whitening.state(seen.state)[:, jnp.array(goal_indices)]
         metrics["robot_loss"] = jnp.mean(jnp.square(output.robot - where))
         loss += metrics["robot_loss"]
     return loss, metrics
