@@ -26,12 +26,16 @@ def _reach_paper() -> Config:
     )
 
 
+def _fast_mil() -> MILConfig:
+    return MILConfig(inner_lr=0.03, learn_inner_lr=True, whiten_actions=True, goal_weight=1.0)
+
+
 def _reach_fast() -> Config:
     return Config(
         network=NetworkConfig(
             strides=(2, 2, 1), soft_argmax=True, fc_layers=(200, 200), goal_head=True, mixed_precision=True
         ),
-        mil=MILConfig(inner_lr=0.03, learn_inner_lr=True, whiten_actions=True, goal_weight=1.0),
+        mil=_fast_mil(),
         optimizer=OptimizerConfig(warmup=0.05, cosine=True, clip_norm=1.0),
         train=TrainConfig(steps=36_000, meta_batch=64, support_frames=3, query_frames=3, redraw=True),
     )
@@ -100,7 +104,7 @@ def _push_fast() -> Config:
         goal_head=True,
         bias_transformation=20,
     )
-    config.mil = MILConfig(inner_lr=0.03, learn_inner_lr=True, whiten_actions=True, goal_weight=1.0)
+    config.mil = _fast_mil()
     config.optimizer = OptimizerConfig(learning_rate=3e-3, warmup=0.05, cosine=True, clip_norm=1.0)
     config.train = TrainConfig(meta_batch=32, support_frames=4, query_frames=8, redraw=True)
     return config
@@ -153,7 +157,7 @@ def _place_fast() -> Config:
             goal_head=True,
             bias_transformation=20,
         ),
-        mil=MILConfig(inner_lr=0.03, learn_inner_lr=True, whiten_actions=True, goal_weight=1.0),
+        mil=_fast_mil(),
         optimizer=OptimizerConfig(learning_rate=3e-3, warmup=0.05, cosine=True, clip_norm=1.0),
         train=TrainConfig(meta_batch=32, support_frames=3, query_frames=8, redraw=True),
         evaluation=EvalConfig(tasks=180, trials=8, baseline_trials=8, batch=90),
