@@ -7,8 +7,6 @@ many kills fall into the writing of one; every third kill waits for that. SIGTER
 code 0 and a word on how to go on.
 """
 
-import hashlib
-import json
 import pathlib
 import random
 import re
@@ -24,7 +22,7 @@ from absl import app, flags, logging
 from rich.console import Console
 
 from milx import config as config_lib
-from milx import policy, provenance, results
+from milx import policy, provenance, pytrees, results
 from milx.checkpoint import Checkpoints
 from milx.data.dataset import Writer
 from milx.recording import RecordedRun
@@ -65,16 +63,12 @@ def finish(data: pathlib.Path, workdir: pathlib.Path) -> str:
     out, _ = process.communicate()
     if process.returncode:
         raise RuntimeError(out[-2000:])
-    config = config_lib.from_dict(json.loads((workdir / "config.json").read_text()))
-    run = RecordedRun(config, workdir, Console(quiet=True))
+    run = RecordedRun(config_lib.read(workdir / "config.json"), workdir, Console(quiet=True))
     checkpoints = Checkpoints(workdir / "checkpoints", read_only=True)
     params = policy.load(workdir).params
     trainer = jax.ShapeDtypeStruct((), np.int32), jax.eval_shape(run.trainer.optimizer.init, params)
     items, _ = checkpoints.restore(STEPS, {"params": params, "trainer": trainer})
-    digest = hashlib.sha256(str(checkpoints.best).encode())
-    for leaf in jax.tree.leaves(items):
-        digest.update(np.ascontiguousarray(leaf).tobytes())
-    return digest.hexdigest()
+    return pytrees.fingerprint({**items, "best": np.array(checkpoints.best)})
 
 
 def writing(workdir: pathlib.Path, before: set[str]) -> bool:
@@ -157,11 +151,8 @@ def main(_: list[str]) -> None:
             found = terminate(folder / "data", workdir, rng, 0.7 * longest)
             if found["sent"]:
                 found["same"] = finish(folder / "data", workdir) == expected
-                if (
-                    found["seconds"] > 10
-                    or found["code"]
-                    or not (found["said_how"] and found["saved"] and found["same"])
-                ):
+                good = found["said_how"] and found["saved"] and found["same"]
+                if found["seconds"] > 10 or found["code"] or not good:
                     raise RuntimeError(f"SIGTERM: {found}")
                 terms.append(found)
                 print(found, flush=True)

@@ -6,7 +6,6 @@ Says for each whether the parameters are the same bit for bit, and how far the l
 run's. More devices are virtual ones where there is no accelerator.
 """
 
-import hashlib
 import itertools
 import json
 import os
@@ -21,7 +20,7 @@ import jax
 import numpy as np
 from absl import app, flags, logging
 
-from milx import policy, provenance, report, results
+from milx import policy, provenance, pytrees, report, results
 
 _OUT = flags.DEFINE_string("out", "experiments/results/robustness", "Folder of the JSON file.")
 _ENVS = flags.DEFINE_list("envs", ["reach", "push"], "Environments.")
@@ -44,7 +43,7 @@ class Outcome(NamedTuple):
 def train(command: list[str], workdir: pathlib.Path, environment: dict[str, str], kill_at: int | None) -> Outcome:
     """Trains; killed when so many updates are written down, and started again."""
     environment = {**os.environ, **environment}
-    script = "import sys\nfrom milx import launch, runs\nlaunch.define_flags()\n"
+    script = "from milx import launch, runs\nlaunch.define_flags()\n"
     script += "launch.run(lambda config, folder: runs.make(config, folder).train())"
     command = [sys.executable, "-c", script, *command, f"--workdir={workdir}"]
     if kill_at is not None:
@@ -56,10 +55,8 @@ def train(command: list[str], workdir: pathlib.Path, environment: dict[str, str]
     done = subprocess.run(command, env=environment, capture_output=True, text=True)
     if done.returncode:
         raise RuntimeError(done.stdout[-1000:] + done.stderr[-1000:])
-    digest = hashlib.sha256()
-    for leaf in jax.tree.leaves(policy.load(workdir).params):
-        digest.update(np.asarray(leaf).tobytes())
-    return Outcome(digest.hexdigest(), np.array([line["loss"] for line in metrics(workdir) if "loss" in line]))
+    digest = pytrees.fingerprint(policy.load(workdir).params)
+    return Outcome(digest, np.array([line["loss"] for line in metrics(workdir) if "loss" in line]))
 
 
 def metrics(workdir: pathlib.Path) -> list[dict[str, float]]:
