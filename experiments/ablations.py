@@ -55,11 +55,15 @@ def markdown(results: dict[str, dict[str, Any]], changed: list[str], seeds: int)
     lines.append("|---|" + "---|" * (seeds + 1))
     for name in changed:
         runs = [results.get(f"{name.replace(' ', '-')}-{seed}") for seed in range(seeds)]
-        low_high = [run and "({:.1%} to {:.1%})".format(*run["wilson95"]) for run in runs]
-        shown = [f"{run['success']:.1%} {of}" if run else "" for run, of in zip(runs, low_high, strict=True)]
+        shown = [_shown(run) if run else "" for run in runs]
         training = next((f"{run['wall_clock_s']['train']:.0f} s" for run in runs if run), "")
         lines.append(f"| {name} | {' | '.join(shown)} | {training} |")
     return "\n".join(lines)
+
+
+def _shown(run: dict[str, Any]) -> str:
+    low, high = run["wilson95"]
+    return f"{run['success']:.1%} ({low:.1%} to {high:.1%})"
 
 
 if __name__ == "__main__":
