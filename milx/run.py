@@ -118,11 +118,12 @@ class Run(abc.ABC):
     def train(self) -> None:
         """Meta-trains to the configured number of steps, from the latest checkpoint if there is one.
 
-        On SIGTERM it writes a checkpoint after the scan under way, which is not validated, and ends the process.
+        On SIGTERM it writes a checkpoint after the scan under way, which is not validated, and ends the process; during
+        a validation, before which there is a checkpoint, it ends at once.
 
         Raises:
             ValueError: if another process trains in this folder, its checkpoints are all damaged, the last one could
-                not be written, or all updates of a scan were skipped because they were not finite.
+                not be written, or MOST_IN_VAIN updates in a row were skipped because they were not finite.
             SystemExit: with code 0, after SIGTERM.
         """
         stop = guard.Stop()
