@@ -87,8 +87,8 @@ class NetworkConfig:
         heads: 1, or 2 for a separate output layer in the inner loss.
         goal_head: predict where the episode ends, from the image, or from the state where the policy sees no pixels,
             and show the prediction to the layers after it (`milx.networks.goal`).
-        robot_head: tell from the image where the robot is, too. Where a demonstration is video alone, its last image
-            then tells the goal head what to look for.
+        hindsight_head: where a demonstration is video alone, learn to tell from its first and last image where the
+            robot went, as the goal head is to see before it goes there, and let that be the goal in the inner step.
         learned_loss: MIL's inner loss where demonstrations show no actions (`mil.given`): "linear", or "temporal" with
             convolutions over time (`milx.networks.learned_loss`); None where they show them.
         context: size of the vector that methods without adaptation keep of a demonstration: units of the LSTM.
@@ -108,7 +108,7 @@ class NetworkConfig:
     bias_transformation: int = 10
     heads: int = 1
     goal_head: bool = False
-    robot_head: bool = False
+    hindsight_head: bool = False
     learned_loss: str | None = None
     context: int = 512
     context_frames: int = 10

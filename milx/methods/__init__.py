@@ -120,8 +120,10 @@ def _check_given(config: Config, spec: Spec) -> None:
         raise ValueError(f"mil.given: got {given!r}, expected one of {', '.join(GIVEN)}")
     if given == "video" and spec.image_shape is None:
         raise ValueError("mil.given: got 'video', expected the state, too: this policy sees no pixels")
-    if config.network.robot_head and not (config.network.goal_head and spec.goal_indices and spec.image_shape):
-        raise ValueError("network.robot_head: got True, expected False: it needs a goal head that sees pixels")
+    has_goal_head = config.network.goal_head and spec.goal_indices and config.method_name == "mil"
+    if config.network.hindsight_head and not (has_goal_head and given == "video"):
+        expected = "False: it is for MIL with a goal head, from video alone (mil.given)"
+        raise ValueError(f"network.hindsight_head: got True, expected {expected}")
     if learned not in (None, *KINDS):
         raise ValueError(f"network.learned_loss: got {learned!r}, expected None or one of {', '.join(KINDS)}")
     if config.method_name == "mil" and (learned is None) != (given == GIVEN[0]):

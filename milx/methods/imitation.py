@@ -37,7 +37,7 @@ def behavioural_cloning(
     whitening: Whitening,
     goal_indices: tuple[int, ...],
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """The mean squared error of the actions (eq. 2), plus the errors of the goal head and the robot head if there are.
+    """The mean squared error of the actions (eq. 2), plus the error of the goal head where there is one.
 
     Args:
         config: scale and weight of the losses.
@@ -57,10 +57,6 @@ def behavioural_cloning(
     if output.goal is not None and demo.goal is not None:
         metrics["goal_loss"] = goal_loss(output.goal, demo.goal, whitening, goal_indices)
         loss += config.goal_weight * metrics["goal_loss"]
-    if output.robot is not None:
-        where = whitening.state(seen.state)[:, jnp.array(goal_indices)]
-        metrics["robot_loss"] = jnp.mean(jnp.square(output.robot - where))
-        loss += metrics["robot_loss"]
     return loss, metrics
 
 
@@ -82,10 +78,11 @@ def calibrate_goal_head(
     goal_indices: tuple[int, ...],
     whitening: Whitening,
 ) -> Params:
-    """A policy's parameters with its goal head started from the calibration (`Spec.image_to_goal`), if there is one."""
+    """A policy's parameters with its goal heads started from the calibration (`Spec.image_to_goal`) if known."""
     if image_to_goal is None:
         return policy
     indices = jnp.array(goal_indices)
     votes = jnp.array(image_to_goal).at[-1].add(-whitening.state_mean[indices]) / whitening.state_scale[indices]
-    controller = policy["controller"]
-    return {**policy, "controller": {**controller, "goal_head": calibrate(controller["goal_head"], votes)}}
+    heads = {name: policy[name] for name in ("controller", "hindsight") if name in policy}
+    heads = {name: {**part, "goal_head": calibrate(part["goal_head"], votes)} for name, part in heads.items()}
+    return {**policy, **heads}

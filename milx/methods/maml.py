@@ -18,9 +18,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from milx.config import GIVEN, MILConfig
+from milx.config import MILConfig
 from milx.methods.base import Method
 from milx.methods.imitation import behavioural_cloning, calibrate_goal_head, flat, goal_loss, shown
+from milx.networks.goal import Goal
 from milx.networks.policy import PolicyNetwork, PolicyOutput
 from milx.types import Demo, Memory, Observation, Params, TaskBatch
 from milx.whitening import Whitening
@@ -105,7 +106,13 @@ class MIL(Method):
 
         def task_loss(support: Demo, query: Demo) -> tuple[jax.Array, dict[str, jax.Array]]:
             adapted = self.adapt(params, support)
-            return self.imitation_loss(adapted["policy"], adapted["whitening"], query)
+            loss, metrics = self.imitation_loss(adapted["policy"], adapted["whitening"], query)
+            if self.network.hindsight is not None and query.goal is not None:
+                whitening = jax.lax.stop_gradient(params["whitening"])
+                told = self._in_hindsight(params["policy"], whitening, query)
+                metrics["hindsight_loss"] = goal_loss(told, query.goal[:, :1], whitening, self.goal_indices)
+                loss += self.config.goal_weight * metrics["hindsight_loss"]
+            return loss, metrics
 
         loss, metrics = jax.vmap(task_loss)(batch.support, batch.query)
         return loss.mean(), {"loss": loss, **metrics}
@@ -126,19 +133,21 @@ class MIL(Method):
         return loss
 
     def _with_seen_goal(self, params: Params, demo: Demo) -> Demo:
-        """Video alone gets a goal for its last image, as if given: where the robot head sees the robot in it.
-
-        In earlier ones a thing that the robot moves may be elsewhere.
-        """
-        if self.config.given != GIVEN[2]:
+        """Video alone gets a goal for its first image, as if given: the hindsight head's."""
+        if self.network.hindsight is None:
             return demo
         whitening, indices = params["whitening"], jnp.array(self.goal_indices, int)
-        end = self._apply(params["policy"], whitening, jax.tree.map(lambda x: x[:, -1:], demo)).robot
-        if end is None:
-            return demo
-        end = whitening.state_mean[indices] + whitening.state_scale[indices] * end
+        goal = self._in_hindsight(params["policy"], whitening, demo).mean
+        goal = whitening.state_mean[indices] + whitening.state_scale[indices] * goal
         unknown = jnp.full((*demo.state.shape[:2], len(indices)), jnp.nan)
-        return dataclasses.replace(demo, goal=unknown.at[:, -1].set(jax.lax.stop_gradient(end)))
+        return dataclasses.replace(demo, goal=unknown.at[:, 0].set(jax.lax.stop_gradient(goal)))
+
+    def _in_hindsight(self, theta: Params, whitening: Whitening, demo: Demo) -> Goal:
+        """Where the robot went in each of the demonstrations [K, T, ...], by their first and last images."""
+        ends = jax.tree.map(lambda x: x[:, jnp.array([0, -1])], demo)
+        seen = self._apply(theta, whitening, ends).seen
+        assert self.network.hindsight is not None and seen is not None
+        return self.network.hindsight(theta, seen.reshape(len(demo.state), 2, *seen.shape[1:]))
 
     def _apply(self, theta: Params, whitening: Whitening, demo: Demo) -> PolicyOutput:
         """What the network says of all time steps of demonstrations [K, T, ...], one after the other."""

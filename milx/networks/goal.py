@@ -96,20 +96,23 @@ class StateGoalHead(nn.Module):
         return Goal(jax.nn.log_softmax(heat), vote, self.param("log_std", nn.initializers.zeros, ()))
 
 
-class RobotHead(nn.Module):
-    """Maps what the convolutions see, [B, F], to where the robot is, [B, G] in whitened units.
+class HindsightHead(nn.Module):
+    """Maps features of videos, [K, T, H, W, C], to where the robot went in each, a `Goal`.
+
+    It compares the first image with the last: what was moved is there in one and not in the other.
 
     Attributes:
         size: G.
     """
 
     size: int
-    hidden: ClassVar[int] = 64
+    hidden: ClassVar[int] = 32
 
     @nn.compact
-    def __call__(self, seen: jax.Array) -> jax.Array:
+    def __call__(self, features: jax.Array) -> Goal:
         """See the class."""
-        return Dense(self.size)(Dense(self.hidden, hidden=True)(seen))
+        both = jnp.concatenate([features[:, 0], features[:, -1]], axis=-1)
+        return GoalHead(self.size, name="goal_head")(Dense(self.hidden, hidden=True)(both))
 
 
 def calibrate(params: Params, image_to_goal: jax.Array) -> Params:

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from milx.config import NetworkConfig
-from milx.networks.goal import Goal, GoalHead, RobotHead, StateGoalHead
+from milx.networks.goal import Goal, GoalHead, HindsightHead, StateGoalHead
 from milx.networks.layers import ConvBlock, Dense, FixedConv, SpatialSoftArgmax
 from milx.networks.learned_loss import LearnedLoss
 from milx.types import Params
@@ -21,14 +21,14 @@ class PolicyOutput(NamedTuple):
         action: [B, A] of the head that acts, in the network's units.
         inner_action: [B, A] of the head that the inner loss sees; the same head if there is only one.
         goal: where the episode will end; None without a goal head.
-        robot: [B, G] whitened, where the robot is, as far as the image tells; None without a robot head.
+        seen: [B, H, W, C] what the convolutions make of the image; None where the policy sees no pixels.
         features: [B, F] what the last layer sees.
     """
 
     action: jax.Array
     inner_action: jax.Array
     goal: Goal | None
-    robot: jax.Array | None
+    seen: jax.Array | None
     features: jax.Array
 
 
@@ -39,11 +39,14 @@ class PolicyNetwork(NamedTuple):
         init: key -> params.
         apply: (params, image [B, H, W, 3] uint8 or None, whitened state [B, S]) -> PolicyOutput.
         learned_loss: (params, features [K, T, F]) -> [K], the loss of demonstrations without actions; None without one.
+        hindsight: (params, what the convolutions make of videos [K, T, H, W, C]) -> Goal, where the robot went in each;
+            None without such a head.
     """
 
     init: Callable[[jax.Array], Params]
     apply: Callable[[Params, jax.Array | None, jax.Array], PolicyOutput]
     learned_loss: Callable[[Params, jax.Array], jax.Array] | None = None
+    hindsight: Callable[[Params, jax.Array], Goal] | None = None
 
 
 class ConvStack(nn.Module):
@@ -88,13 +91,11 @@ class Controller(nn.Module):
             context: [B, D], joins the input of the first fully connected layer.
             query: [B, C] or, without features, [B, candidates]: tells the goal head what to look for; None for nothing.
         """
-        config, goal, robot = self.config, None, None
+        config, goal = self.config, None
         parts, has_goal = [state, context], config.goal_head and self.goal_size
         if features is not None:
             seen = SpatialSoftArgmax()(features) if config.soft_argmax else features.reshape(len(features), -1)
             parts = [seen, *parts]
-            if config.robot_head:
-                robot = RobotHead(self.goal_size, name="robot_head")(seen)
         if has_goal:
             head, on = (StateGoalHead, state) if features is None else (GoalHead, features)
             goal = head(self.goal_size, name="goal_head")(on, query)
@@ -103,7 +104,7 @@ class Controller(nn.Module):
         for size in config.fc_layers:
             x = Dense(size, hidden=True, norm=config.fc_norm, init_std=config.fc_init_std)(x)
         heads = [Dense(self.action_size, init_std=config.fc_init_std)(x) for _ in range(config.heads)]
-        return PolicyOutput(action=heads[-1], inner_action=heads[0], goal=goal, robot=robot, features=x)
+        return PolicyOutput(action=heads[-1], inner_action=heads[0], goal=goal, seen=features, features=x)
 
 
 class _Policy(nn.Module):
@@ -137,14 +138,18 @@ def make_policy(
     module = _Policy(config, action_size, goal_size)
     image = None if image_shape is None else jnp.zeros((1, *image_shape, 3), jnp.uint8)
 
-    loss = LearnedLoss(config.learned_loss or "linear")
+    loss, head = LearnedLoss(config.learned_loss or "linear"), HindsightHead(goal_size)
 
     def init(key: jax.Array) -> Params:
         output, variables = module.init_with_output(key, image, jnp.zeros((1, state_size)))
-        if config.learned_loss is None:
-            return variables["params"]
-        start = loss.init(jax.random.fold_in(key, 1), output.features[None])
-        return {**variables["params"], "learned_loss": start["params"]}
+        params = variables["params"]
+        if config.learned_loss is not None:
+            start = loss.init(jax.random.fold_in(key, 1), output.features[None])
+            params = {**params, "learned_loss": start["params"]}
+        if config.hindsight_head:
+            start = head.init(jax.random.fold_in(key, 2), output.seen[None])
+            params = {**params, "hindsight": start["params"]}
+        return params
 
     def apply(params: Params, image: jax.Array | None, state: jax.Array) -> PolicyOutput:
         output = module.apply({"params": params}, image, state)
@@ -156,4 +161,14 @@ def make_policy(
         assert isinstance(value, jax.Array)
         return value
 
-    return PolicyNetwork(init, apply, None if config.learned_loss is None else learned_loss)
+    def hindsight(params: Params, seen: jax.Array) -> Goal:
+        goal = head.apply({"params": params["hindsight"]}, seen)
+        assert isinstance(goal, Goal)
+        return goal
+
+    return PolicyNetwork(
+        init,
+        apply,
+        None if config.learned_loss is None else learned_loss,
+        hindsight if config.hindsight_head else None,
+    )

@@ -199,3 +199,15 @@ def test_demonstrations_that_show_too_little_are_refused(vision, given, learned,
     config.mil.given = given
     with pytest.raises(ValueError, match=message):
         methods.make(config, spec)
+
+
+@pytest.mark.parametrize(("name", "given", "goal_head"), [("contextual", "video", True), ("mil", "video", False)])
+def test_a_hindsight_head_without_use_is_refused(name, given, goal_head):
+    spec = methods.Spec((32, 40), STATE, ACTION, ((-1.0,) * ACTION, (1.0,) * ACTION), goal_indices=(1,))
+    network = NetworkConfig(learned_loss="linear", goal_head=goal_head, hindsight_head=True)
+    config = Config(method_name=name, network=network)
+    config.mil.given = given
+    with pytest.raises(
+        ValueError, match=r"network\.hindsight_head: got True, expected False: it is for MIL with a goal"
+    ):
+        methods.make(config, spec)

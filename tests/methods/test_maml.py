@@ -165,7 +165,7 @@ def test_no_gradient_reaches_the_whitening_and_adam_leaves_it(batch):
 CONSTANT = PolicyNetwork(
     init=lambda key: jnp.zeros(ACTION),
     apply=lambda theta, image, state: PolicyOutput(
-        *[jnp.broadcast_to(theta, (len(state), ACTION))] * 2, goal=None, robot=None, features=state
+        *[jnp.broadcast_to(theta, (len(state), ACTION))] * 2, goal=None, seen=None, features=state
     ),
 )
 THETA = np.array([0.4, -1.3])
@@ -234,27 +234,37 @@ def test_closed_form_of_the_clipped_step(constant_case):
     np.testing.assert_allclose(gradient["policy"], expected.mean(axis=0), rtol=1e-11)
 
 
-def test_a_video_teaches_the_goal_where_the_robot_head_sees_the_robot_at_its_end(batch):
-    """One vote, theta, of deviation one: the inner gradient is the vote minus the place, whatever the states are."""
-    place = jnp.array([0.2, 0.9])
+def test_a_video_teaches_the_goal_that_hindsight_sees_in_its_first_and_last_image(batch):
+    """One vote, theta, of deviation one: the inner gradient is the vote minus that goal, whatever the states are."""
+    corner = lambda image: image[..., 0, 0, :2] / 255.0  # noqa: E731
     network = PolicyNetwork(
         init=CONSTANT.init,
         apply=lambda theta, image, state: CONSTANT.apply(theta, image, state)._replace(
-            goal=Goal(jnp.zeros((len(state), 1)), theta[None], jnp.zeros(())),
-            robot=jnp.broadcast_to(place, (len(state), 2)),
+            goal=Goal(jnp.zeros((len(state), 1)), theta[None], jnp.zeros(())), seen=corner(image)[:, None, None]
         ),
         learned_loss=lambda theta, features: jnp.zeros(len(features)),
+        hindsight=lambda theta, seen: Goal(
+            jnp.zeros((len(seen), 1)), (seen[:, 0] + 3 * seen[:, -1])[:, 0], jnp.asarray(-0.2)
+        ),
     )
     config = MILConfig(inner_lr=ALPHA, goal_weight=0.7, inner_clip=NO_CLIP, given="video")
     method = MIL(config, network, GOAL_INDICES)
     params = {"policy": jnp.asarray(THETA), "whitening": random_whitening(np.random.default_rng(4))}
-    support, query = (jax.tree.map(lambda x: x[0], demo) for demo in (batch.support, batch.query))
+    support = jax.tree.map(lambda x: x[0], batch.support)
+    goal = lambda demo: np.asarray(corner(demo.image[..., 0, :, :, :]) + 3 * corner(demo.image[..., -1, :, :, :]))  # noqa: E731
     adapted = method.adapt(params, support)["policy"]
-    np.testing.assert_allclose(adapted, THETA - ALPHA * 0.7 * (THETA - place), rtol=1e-12)
+    np.testing.assert_allclose(adapted, THETA - ALPHA * 0.7 * (THETA - goal(support)[0]), rtol=1e-12)
 
-    _, metrics = method.imitation_loss(params["policy"], params["whitening"], query)
-    where = params["whitening"].state(np.asarray(query.state))[..., np.array(GOAL_INDICES)]
-    np.testing.assert_allclose(metrics["robot_loss"], np.mean((np.asarray(place) - where) ** 2), rtol=1e-12)
+    loss, metrics = method.loss(params, batch)
+    indices = np.array(GOAL_INDICES)
+    mean, scale = (np.asarray(x)[indices] for x in (params["whitening"].state_mean, params["whitening"].state_scale))
+    square = np.sum((goal(batch.query) - (np.asarray(batch.query.goal)[:, :, 0] - mean) / scale) ** 2, axis=-1)
+    expected = 0.5 * np.exp(0.4) * square.mean(axis=-1) + np.log(2 * np.pi) - 2 * 0.2
+    np.testing.assert_allclose(metrics["hindsight_loss"], expected, rtol=1e-12)
+    total = metrics["action_loss"] + 0.7 * (metrics["goal_loss"] + expected)
+    np.testing.assert_allclose(loss, total.mean(), rtol=1e-12)
+    learned = jax.grad(lambda params: method.loss(params, batch)[0])(params)
+    assert all(not np.any(leaf) for leaf in jax.tree.leaves(learned["whitening"]))
 
 
 def test_goal_head_learns_the_goal_of_each_time_step(batch):
@@ -286,14 +296,16 @@ def test_goal_head_learns_the_goal_of_each_time_step(batch):
 
 
 def test_votes_start_from_the_cameras_calibration_in_whitened_units():
-    network, _ = random_params(goal_head=True)
+    network, _ = random_params(goal_head=True, hindsight_head=True)
     whitening, corner = random_whitening(np.random.default_rng(4)), np.array([0.3, -0.6, 1.0])
     image_to_goal = ((0.4, 0.0), (0.1, -0.2), (0.3, 0.5))
     method = MIL(MILConfig(), network, GOAL_INDICES, image_to_goal)
-    votes = corner @ np.asarray(method.init(jax.random.key(0), whitening)["policy"]["controller"]["goal_head"]["vote"])
+    policy = method.init(jax.random.key(0), whitening)["policy"]
     state = np.zeros(STATE)
     state[list(GOAL_INDICES)] = corner @ np.array(image_to_goal)
-    np.testing.assert_allclose(votes, np.asarray(whitening.state(state))[list(GOAL_INDICES)], rtol=1e-6)
+    for part in ("controller", "hindsight"):
+        votes = corner @ np.asarray(policy[part]["goal_head"]["vote"])
+        np.testing.assert_allclose(votes, np.asarray(whitening.state(state))[list(GOAL_INDICES)], rtol=1e-6)
 
 
 # Laws of the inner step.

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.special import softmax
 from scipy.stats import multivariate_normal
 
-from milx.networks.goal import Goal, GoalHead, StateGoalHead
+from milx.networks.goal import Goal, GoalHead, HindsightHead, StateGoalHead
 from milx.networks.layers import positions
 
 BATCH, HEIGHT, WIDTH, CHANNELS, GOAL = 5, 3, 4, 6, 2
@@ -83,3 +83,20 @@ def test_votes_are_affine_in_the_position_and_the_weights_follow_the_features(rn
     x, y = (2 * spot[1] + 1) / WIDTH - 1, (2 * spot[0] + 1) / HEIGHT - 1  # the cell's centre in the image
     # e^54 against eleven positions without features.
     np.testing.assert_allclose(found.mean[0], np.array([x, y, 1.0]) @ params["vote"], rtol=1e-12)
+
+
+def test_hindsight_is_where_the_first_image_differs_from_the_last(rng):
+    """Filters that subtract one from the other find the one place that lost its features, whatever lies between."""
+    units = HindsightHead.hidden
+    seen = rng.uniform(size=(1, 3, HEIGHT, WIDTH, CHANNELS))
+    seen[0, -1] = seen[0, 0]
+    seen[0, -1, 2, 1] -= 1.0
+    minus = np.eye(CHANNELS, units)
+    vote = rng.standard_normal((3, GOAL))
+    params = {
+        "Dense_0": {"kernel": np.concatenate([minus, -minus]), "bias": np.zeros(units)},
+        "goal_head": {"kernel": np.full(units, 50.0), "vote": vote, "log_std": np.zeros(())},
+    }
+    found = HindsightHead(GOAL).apply({"params": params}, jnp.asarray(seen))
+    where = np.array([3 / WIDTH - 1, 5 / HEIGHT - 1, 1.0])
+    np.testing.assert_allclose(found.mean[0], where @ vote, rtol=1e-9)
