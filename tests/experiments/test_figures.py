@@ -77,6 +77,7 @@ def test_readme_shows_what_the_scripts_print(flags):
         printed.append(tables.markdown(one.TABLE, list(one.TABLE.rows), found).split("\n\n")[0])
     printed.append(ablations.markdown(cells.read(results / "ablations"), list(ablations.ABLATIONS), seeds=2))
     printed.append(figure := figure3.markdown(list(cells.read(results / "figure3").values())))
+    printed.append(figure3.markdown(list(cells.read(results / "figure3_push").values())))
     lines = [line for text in printed for line in text.splitlines()]
     assert len(lines) > 50
     assert [line for line in lines if line not in readme] == []
