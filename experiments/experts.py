@@ -1,76 +1,71 @@
-"""Who demonstrates push more reliably, its controller or iLQR started from it, without and with noise on the actions.
+"""Who demonstrates push more reliably: its controller, with and without a choice of tactics, or iLQR started from it.
 
-    python experiments/experts.py       # about five minutes on a GPU, half of it compilation
+    python experiments/experts.py                   # on a GPU: iLQR takes long to compile
+    python experiments/experts.py --iterations=0    # the controller alone
 
-Training scenes, floors beside them. The controller answers to where the object is; a plan's feedback is linear around
-one trajectory.
+Training and validation scenes, without and with noise on the actions. A plan's feedback is linear around one
+trajectory; the controller answers to where the object is.
 """
 
 import functools
 import pathlib
 import time
+from collections.abc import Callable
 from typing import Any
 
 import jax
 from absl import app, flags
 
 from milx import envs, provenance, results
-from milx.envs.base import Env, State, Task
 from milx.evaluator import wilson_interval
-from milx.methods.random import Random
-from milx.rollout import rollout
-from milx.trajopt.expert import demonstrate, plan
+from milx.trajopt.expert import judge, perform
 from milx.trajopt.ilqr import Options
 
 _OUT = flags.DEFINE_string("out", "experiments/results/experts/push.json", "The JSON file.")
-_SCENES = flags.DEFINE_integer("scenes", 256, "Scenes, each of another task.", lower_bound=1)
-_ITERATIONS = flags.DEFINE_integer("iterations", 5, "Most iterations of iLQR.", lower_bound=1)
+_SCENES = flags.DEFINE_integer("scenes", 512, "Scenes of each split, each of another task.", lower_bound=1)
+_ITERATIONS = flags.DEFINE_integer("iterations", 5, "Most iterations of iLQR; 0 for no iLQR.", lower_bound=0)
 NOISE = (0.0, 0.1)
 """Standard deviation on the actions; the presets' is the last."""
 
 
-def run(env: Env, scenes: int, iterations: int) -> dict[str, Any]:
-    """Success of every expert at every noise, by the paper's criterion, with counts, intervals and seconds."""
+def experts(iterations: int) -> dict[str, Callable[..., Any]]:
+    """Functions of tasks, scenes, keys and noise, by name."""
+    env, plain = (envs.make("push", (16, 16)) for _ in range(2))
+    plain.tactics = plain.tactics[:1]
+    found = {
+        "controller": functools.partial(_success, env, Options(iterations=0)),
+        "controller, one tactic": functools.partial(_success, plain, Options(iterations=0)),
+    }
+    return found | ({"iLQR": functools.partial(_success, plain, Options(iterations=iterations))} if iterations else {})
+
+
+def _success(env: envs.Env, options: Options, split: str, scenes: int, noise: float, blind: bool = False) -> jax.Array:
     task_keys, scene_keys, keys = (jax.random.split(key, scenes) for key in jax.random.split(jax.random.key(0), 3))
-    tasks = jax.vmap(lambda key: env.sample_task(key, "train"))(task_keys)
+    tasks = jax.vmap(lambda key: env.sample_task(key, split))(task_keys)
     states = jax.vmap(env.reset)(scene_keys, tasks)
-    began = time.perf_counter()
-    options = Options(iterations=iterations)
-    plans = jax.jit(jax.vmap(lambda task, state: plan(env, task, state, options)))(tasks, states)
-    jax.block_until_ready(plans)
-    planned_s = time.perf_counter() - began
-
-    @functools.partial(jax.jit, static_argnames="planned")
-    def succeeds(believed: Task, noise: float, planned: bool) -> jax.Array:
-        def one(believed: Task, task: Task, state: State, expert: Any, key: jax.Array) -> jax.Array:
-            visited, _ = demonstrate(env, believed, state, expert if planned else None, key, noise)
-            return env.success(task, visited)
-
-        return jax.vmap(one)(believed, tasks, states, plans, keys)
-
-    def random(task: Task, state: State, key: jax.Array) -> jax.Array:
-        return env.success(task, rollout(env, Random(env.action_size), (), task, state, key)[0])
-
-    def rate(success: jax.Array) -> dict[str, Any]:
-        count = int(success.sum())
-        return {"successes": count, "success": count / scenes, "wilson95": wilson_interval(count, scenes)}
-
-    found: dict[str, Any] = {"scenes": scenes, "iterations": iterations, "planning_and_compilation_s": planned_s}
-    for noise in NOISE:
-        found[f"controller, noise {noise}"] = rate(succeeds(tasks, noise, planned=False))
-        found[f"iLQR, noise {noise}"] = rate(succeeds(tasks, noise, planned=True))
-    found["task-blind controller"] = rate(succeeds(jax.vmap(env.task_blind)(keys, tasks), 0.0, planned=False))
-    return found | {"random": rate(jax.jit(jax.vmap(random))(tasks, states, keys))}
+    believed = jax.vmap(env.task_blind)(keys, tasks) if blind else tasks
+    visited, _ = perform(env, believed, states, keys, options, noise)
+    return judge(env, tasks, visited)[0]
 
 
 def main(_: list[str]) -> None:
     """Runs, prints and writes."""
-    found = run(envs.make("push", (16, 16)), _SCENES.value, _ITERATIONS.value)
-    for name, value in found.items():
-        print(f"{name}: {value['success']:.1%}" if isinstance(value, dict) else f"{name}: {value}", flush=True)
+    found: list[dict[str, Any]] = []
+    for name, success in experts(_ITERATIONS.value).items():
+        for split in ("train", "validation"):
+            runs = {f"noise {noise}": (noise, False) for noise in NOISE}
+            runs |= {"task-blind": (0.0, True)} if name == "controller" else {}
+            for how, (noise, blind) in runs.items():
+                began = time.perf_counter()
+                count = int(success(split, _SCENES.value, noise, blind).sum())
+                row = {"expert": name, "split": split, "how": how, "seconds": time.perf_counter() - began}
+                rate = {"success": count / _SCENES.value, "wilson95": wilson_interval(count, _SCENES.value)}
+                found.append(row | rate)
+                print(f"{name}, {split}, {how}: {rate['success']:.1%}, {row['seconds']:.0f} s", flush=True)
+    contents = {"scenes": _SCENES.value, "iterations": _ITERATIONS.value, "experts": found}
     path = pathlib.Path(_OUT.value)
     path.parent.mkdir(parents=True, exist_ok=True)
-    results.write_json(path, found | provenance.describe())
+    results.write_json(path, contents | provenance.describe())
 
 
 if __name__ == "__main__":

@@ -131,7 +131,8 @@ def baselines(env: Env, demos: DemoSet, config: EvalConfig, expert: DataConfig, 
     believed = jax.vmap(env.task_blind)(keys, task), task
     twice = [jax.tree.map(lambda *xs: jnp.concatenate(xs), *pair) for pair in (believed, (scene, scene), (keys, keys))]
     options = Options(iterations=expert.plan_iterations)
-    states, _ = map_in_chunks(lambda *chunk: perform(env, *chunk, options, 0.0), tuple(twice), expert.plan_batch)
+    plan = functools.partial(perform, env, options=options, noise=0.0)
+    states, _ = map_in_chunks(plan, tuple(twice), expert.plan_batch)
     as_it_is = jax.tree.map(lambda x: jnp.concatenate([x, x]), task)
     success, other = map_in_chunks(functools.partial(judge, env), (as_it_is, states), expert.plan_batch)
     random = run_trials(env, Random(env.action_size), (), demos, config, key)

@@ -103,8 +103,8 @@ class GymEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         """
         config = config or make_config(self.env.name, preset="fast").data
         scene = self._reset(self._key(), self._task)
-        batch = jax.tree.map(lambda x: x[None], (self._task, scene, self._key()))
-        planned = perform(self.env, *batch, Options(iterations=config.plan_iterations), config.noise)
+        task, state, key = jax.tree.map(lambda x: x[None], (self._task, scene, self._key()))
+        planned = perform(self.env, task, state, key, Options(iterations=config.plan_iterations), config.noise)
         states, action = jax.tree.map(lambda x: x[0], planned)
         return jax.tree.map(np.asarray, jax.jit(render_demo, static_argnums=0)(self.env, self._task, states, action))
 

@@ -79,12 +79,14 @@ def collect(
     tasks, *inputs = _draw(env, jax.random.fold_in(key, SPLITS.index(split)), split, num_tasks, num_demos)
     options, numbers = Options(iterations=config.plan_iterations), itertools.count()
 
-    def plan_part(*part: Any) -> Any:
-        make = functools.partial(perform, env, *part, options, config.noise)
+    def plan_part(task: Task, state: State, key: jax.Array) -> tuple[State, jax.Array]:
+        make = functools.partial(perform, env, task, state, key, options, config.noise)
         if parts is None:
             return make()
         path = parts.with_name(f"{parts.name}-{next(numbers)}.npz")
-        return pytrees.kept(path, make, lambda: jax.eval_shape(make))
+        like = shapes(env, 1, len(key))
+        like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), (like.states, like.action))
+        return pytrees.kept(path, make, lambda: like)
 
     states, action = map_in_chunks(plan_part, tuple(inputs), config.plan_batch)
     success, _ = map_in_chunks(functools.partial(judge, env), (inputs[0], states), config.plan_batch)

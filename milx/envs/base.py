@@ -68,6 +68,7 @@ class Env(abc.ABC):
         height_index: the entry that tells how high its hand is, where it must come down to an object; None otherwise.
         vision: whether the policy sees the image; if not, the state tells it where the objects are.
         object_indices: [O][2] entries of the state with each object's place, where the state tells them.
+        tactics: what the controller can be told, a number; who demonstrates tries them in this order.
     """
 
     name: str
@@ -80,6 +81,7 @@ class Env(abc.ABC):
     height_index: int | None = None
     vision: bool = True
     object_indices: tuple[tuple[int, ...], ...] = ()
+    tactics: tuple[float, ...] = (0.0,)
 
     def __init__(self, model: mujoco.MjModel, image_shape: tuple[int, int] | None = None):
         self.mj_model = model
@@ -186,8 +188,8 @@ class Env(abc.ABC):
     def task_blind(self, key: jax.Array, task: Task) -> Task:
         """The task as someone understands it who saw no demonstration: a random candidate is the target."""
 
-    def control(self, task: Task, state: State) -> jax.Array:
-        """[A] a controller that knows the task: it demonstrates where nothing is planned.
+    def control(self, task: Task, state: State, tactic: jax.Array) -> jax.Array:
+        """[A] a controller that knows the task, with one of the `tactics`: it demonstrates where iLQR does not.
 
         Raises:
             ValueError: unless overridden.

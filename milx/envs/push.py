@@ -88,6 +88,7 @@ class Push(Env):
     state_size = 20
     goal_indices = (14, 15)
     height_index = 16
+    tactics = (0.0, 0.02, -0.02)
 
     def __init__(self, image_shape: tuple[int, int] | None = None):
         super().__init__(_build(), image_shape)
@@ -207,15 +208,16 @@ class Push(Env):
 
     def guess(self, task: PushTask, state: State) -> jax.Array:
         """[T, 7] what `push_controller` does from here."""
+        tactic = jnp.asarray(self.tactics[0])
 
         def step(state: State, _: None) -> tuple[State, jax.Array]:
-            action = self.control(task, state)
+            action = self.control(task, state, tactic)
             return self.step(task, state, action), action
 
         return jax.lax.scan(step, state, length=self.horizon)[1]
 
-    def control(self, task: PushTask, state: State) -> jax.Array:
-        """[7] the action of `push_controller` for one state."""
+    def control(self, task: PushTask, state: State, tactic: jax.Array) -> jax.Array:
+        """[7] the action of `push_controller` for one state, pushing so far (m) to the side of the object's centre."""
         target = task.target
         x, y, turn = self.objects(state)[target]
         pose, jacobian = self.hand(state.qpos), jax.jacfwd(self.hand)(state.qpos)[:, :NUM_JOINTS]
@@ -227,7 +229,7 @@ class Push(Env):
         outline = task.size[target] * (jnp.max(shape.ends @ backwards, axis=-1) + shape.radius).max()
         joints, velocity = self.model.dof_damping[:NUM_JOINTS], state.qvel[:NUM_JOINTS]
         touching, friction = outline + self._prong, task.damping[target]
-        torque = push_controller.torque(pose, jacobian, velocity, joints, place, ahead, touching, friction)
+        torque = push_controller.torque(pose, jacobian, velocity, joints, place, ahead, touching, tactic, friction)
         return jnp.clip(torque / self.mj_model.actuator_gear[:, 0], *self.action_range)
 
     def running_residual(self, task: PushTask, state: State, action: jax.Array, t: jax.Array) -> jax.Array:

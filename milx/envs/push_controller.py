@@ -39,6 +39,7 @@ def torque(
     place: jax.Array,
     ahead: jax.Array,
     touching: jax.Array,
+    aside: jax.Array,
     friction: jax.Array,
 ) -> jax.Array:
     """Torques of the joints [7] (N m) for one time step.
@@ -51,15 +52,17 @@ def torque(
         place: [2] of the object's centre (m); the goal is at 0.
         ahead: [2] unit vector from the object's centre to the goal.
         touching: how far behind the object's centre the tip is when it touches the object (m).
+        aside: how far to the left of the object's centre, as the hand sees it, the hand pushes (m): where a long thing
+            turns away from under a hand behind its centre, another place may do.
         friction: of the object against sliding (N s/m).
     """
     tip, away = pose[:3], jnp.linalg.norm(place)
     across = jnp.array([-ahead[1], ahead[0]])
-    along, side = (tip[:2] - place) @ ahead, (tip[:2] - place) @ across
+    along, side = (tip[:2] - place) @ ahead, (tip[:2] - place) @ across - aside
     behind = (along < 0) & (along > -touching - 0.1) & (jnp.abs(side) < SIDE)
     pushing = behind & (tip[2] < LIFTED)
 
-    to_place = place - (touching + MARGIN) * ahead - tip[:2]
+    to_place = place - (touching + MARGIN) * ahead + aside * across - tip[:2]
     far = jnp.linalg.norm(to_place) > NEAR
     risen = jnp.where(far, jnp.clip((tip[2] - 0.05) / 0.06, 0, 1), 1.0)
     travel = risen * _at_most(5.0 * to_place, TRAVEL_SPEED)

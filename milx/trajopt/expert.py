@@ -1,14 +1,15 @@
 """Experts: plan every scene once by iLQR, then run the plan's feedback with noise on the actions.
 
 The noise drives the arm off the plan and the recorded action is the feedback's answer, before the noise: a
-demonstration so shows how to recover, and its labels are clean (DART, Laskey et al. 2017). Where nothing is planned
-(no iterations) the feedback is the environment's controller.
+demonstration so shows how to recover, and its labels are clean (DART, Laskey et al. 2017). Where iLQR does not plan
+(no iterations) the feedback is the environment's controller, with a tactic that a rehearsal without noise chooses.
 """
 
 import functools
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from milx import parallel
 from milx.envs.base import Env, State, Task
@@ -29,7 +30,7 @@ def plan(env: Env, task: Task, state: State, options: Options) -> Plan:
 
 
 def demonstrate(
-    env: Env, task: Task, state: State, expert: Plan | None, key: jax.Array, noise: float
+    env: Env, task: Task, state: State, expert: Plan | jax.Array, key: jax.Array, noise: float
 ) -> tuple[State, jax.Array]:
     """Runs feedback from `state` with Gaussian noise of standard deviation `noise` on the actions.
 
@@ -37,7 +38,7 @@ def demonstrate(
         env: the environment.
         task: what is to be done.
         state: the scene.
-        expert: the plan whose feedback runs; None for the environment's controller.
+        expert: the plan whose feedback runs, or the tactic of the environment's controller.
         key: draws the noise.
         noise: in units of the action.
 
@@ -47,8 +48,9 @@ def demonstrate(
     low, high = env.action_range
 
     def feedback(state: State, planned: tuple | None) -> jax.Array:
-        if planned is None:
-            return env.control(task, state)
+        if not isinstance(expert, Plan):
+            return env.control(task, state, expert)
+        assert planned is not None
         nominal_state, nominal_action, gain = planned
         return nominal_action + gain @ (state.vector - nominal_state)
 
@@ -59,22 +61,52 @@ def demonstrate(
         return after, (state, action)
 
     keys = jax.random.split(key, env.horizon)
-    planned = None if expert is None else (expert.states[:-1], expert.actions, expert.gains)
+    planned = (expert.states[:-1], expert.actions, expert.gains) if isinstance(expert, Plan) else None
     last, (states, actions) = jax.lax.scan(step, state, (planned, keys))
     return jax.tree.map(lambda xs, x: jnp.concatenate([xs, x[None]]), states, last), actions
 
 
-@functools.partial(jax.jit, static_argnums=(0, 4))
 def perform(
     env: Env, task: Task, state: State, key: jax.Array, options: Options, noise: float
 ) -> tuple[State, jax.Array]:
     """Plans and demonstrates a batch: `task`, `state` and `key` have a leading axis; so have the results."""
+    if options.iterations:
+        return _perform_planned(env, task, state, key, options, noise)
+    return _perform_controlled(env, task, state, key, choose_tactics(env, task, state, key), noise)
 
+
+def choose_tactics(env: Env, task: Task, state: State, key: jax.Array) -> np.ndarray:
+    """[N] the first tactic with which the environment's controller succeeds in a rehearsal of each scene of a batch.
+
+    Rehearsals are without noise. Where no tactic succeeds it is the first of all.
+    """
+    every = [np.full(len(key), tactic) for tactic in env.tactics]
+    if len(every) == 1:
+        return every[0]
+    rehearsals = (_perform_controlled(env, task, state, key, each, 0.0)[0] for each in every)
+    success = [np.asarray(judge(env, task, states)[0]) for states in rehearsals]
+    return np.array(env.tactics)[np.argmax(success, axis=0)]
+
+
+@functools.partial(jax.jit, static_argnums=(0, 4))
+def _perform_planned(
+    env: Env, task: Task, state: State, key: jax.Array, options: Options, noise: float
+) -> tuple[State, jax.Array]:
     def one(noise: float, task: Task, state: State, key: jax.Array) -> tuple[State, jax.Array]:
-        expert = plan(env, task, state, options) if options.iterations else None
-        return demonstrate(env, task, state, expert, key, noise)
+        return demonstrate(env, task, state, plan(env, task, state, options), key, noise)
 
     return parallel.split_tasks(jax.vmap(one, in_axes=(None, 0, 0, 0)), shared=1)(noise, task, state, key)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _perform_controlled(
+    env: Env, task: Task, state: State, key: jax.Array, tactic: np.ndarray, noise: float
+) -> tuple[State, jax.Array]:
+    def one(noise: float, task: Task, state: State, tactic: jax.Array, key: jax.Array) -> tuple[State, jax.Array]:
+        return demonstrate(env, task, state, tactic, key, noise)
+
+    in_axes = (None, 0, 0, 0, 0)
+    return parallel.split_tasks(jax.vmap(one, in_axes=in_axes), shared=1)(noise, task, state, tactic, key)
 
 
 @functools.partial(jax.jit, static_argnums=0)

@@ -110,16 +110,17 @@ def shown(env):
     return tasks, *perform(env, tasks, scenes, keys, Options(iterations=0), 0.1)
 
 
-def test_the_controller_pushes_most_objects_to_the_goal_in_spite_of_noise(env, shown):
+def test_the_controller_pushes_almost_all_objects_to_the_goal_in_spite_of_noise(env, shown):
     tasks, states, _ = shown
-    assert jax.jit(jax.vmap(env.success))(tasks, states).mean() > 0.85
+    assert jax.jit(jax.vmap(env.success))(tasks, states).mean() > 0.9
 
 
 def test_demonstrations_record_the_controllers_answers_before_the_noise(env, shown):
     tasks, states, action = jax.tree.map(lambda x: x[:3], shown)
     before = jax.tree.map(lambda x: x[:, :-1], states)
-    answer = jax.jit(jax.vmap(jax.vmap(env.control, in_axes=(None, 0))))(tasks, before)
-    np.testing.assert_allclose(action, answer, atol=1e-9)
+    answers = jax.jit(jax.vmap(jax.vmap(jax.vmap(env.control, (None, None, 0)), (None, 0, None)), (0, 0, None)))
+    off = np.abs(answers(tasks, before, jnp.array(env.tactics)) - action[:, :, None]).max(axis=(1, 3))
+    assert off.min(axis=1).max() < 1e-9, "one and the same tactic all the time"
     quiet = jax.jit(jax.vmap(jax.vmap(env.step, in_axes=(None, 0, 0))))(tasks, before, action)
     moved = np.linalg.norm(quiet.qvel[..., :NUM_JOINTS] - states.qvel[:, 1:, :NUM_JOINTS], axis=-1)
     assert moved.min() > 1e-4
