@@ -1,71 +1,70 @@
 """Who demonstrates push more reliably: its controller, with and without a choice of tactics, or iLQR started from it.
 
-    python experiments/experts.py                   # on a GPU: iLQR takes long to compile
-    python experiments/experts.py --iterations=0    # the controller alone
+    python experiments/experts.py                                              # on a GPU: iLQR takes long to compile
+    python experiments/experts.py --experts=controller --experts=one-tactic    # on a CPU, too
 
 Training and validation scenes, without and with noise on the actions. A plan's feedback is linear around one
-trajectory; the controller answers to where the object is.
+trajectory; the controller answers to where the object is. What has its file is not run again.
 """
 
 import functools
 import pathlib
 import time
-from collections.abc import Callable
 from typing import Any
 
 import jax
 from absl import app, flags
 
 from milx import envs, provenance, results
+from milx.chunks import map_in_chunks
 from milx.evaluator import wilson_interval
 from milx.trajopt.expert import judge, perform
 from milx.trajopt.ilqr import Options
 
-_OUT = flags.DEFINE_string("out", "experiments/results/experts/push.json", "The JSON file.")
-_SCENES = flags.DEFINE_integer("scenes", 512, "Scenes of each split, each of another task.", lower_bound=1)
-_ITERATIONS = flags.DEFINE_integer("iterations", 5, "Most iterations of iLQR; 0 for no iLQR.", lower_bound=0)
+EXPERTS = {"controller": 0, "one-tactic": 0, "ilqr": 5}
+"""By name, the most iterations of iLQR."""
 NOISE = (0.0, 0.1)
 """Standard deviation on the actions; the presets' is the last."""
+_EXPERTS = flags.DEFINE_multi_enum("experts", list(EXPERTS), list(EXPERTS), "Which (repeat the flag).")
+_OUT = flags.DEFINE_string("out", "experiments/results/experts", "Folder of the JSON files.")
+_SCENES = flags.DEFINE_integer("scenes", 512, "Scenes of each split, each of another task.", lower_bound=1)
 
 
-def experts(iterations: int) -> dict[str, Callable[..., Any]]:
-    """Functions of tasks, scenes, keys and noise, by name."""
-    env, plain = (envs.make("push", (16, 16)) for _ in range(2))
-    plain.tactics = plain.tactics[:1]
-    found = {
-        "controller": functools.partial(_success, env, Options(iterations=0)),
-        "controller, one tactic": functools.partial(_success, plain, Options(iterations=0)),
-    }
-    return found | ({"iLQR": functools.partial(_success, plain, Options(iterations=iterations))} if iterations else {})
+def compare(name: str, scenes: int) -> list[dict[str, Any]]:
+    """Success of an expert for each split and noise; of the controller also blind to the task.
 
-
-def _success(env: envs.Env, options: Options, split: str, scenes: int, noise: float, blind: bool = False) -> jax.Array:
-    task_keys, scene_keys, keys = (jax.random.split(key, scenes) for key in jax.random.split(jax.random.key(0), 3))
-    tasks = jax.vmap(lambda key: env.sample_task(key, split))(task_keys)
-    states = jax.vmap(env.reset)(scene_keys, tasks)
-    believed = jax.vmap(env.task_blind)(keys, tasks) if blind else tasks
-    visited, _ = perform(env, believed, states, keys, options, noise)
-    return judge(env, tasks, visited)[0]
+    The seconds of the first entry include compilation.
+    """
+    env, options = envs.make("push", (16, 16)), Options(iterations=EXPERTS[name])
+    if name == "one-tactic":
+        env.tactics = env.tactics[:1]
+    found = []
+    for split in ("train", "validation"):
+        task_keys, scene_keys, keys = (jax.random.split(key, scenes) for key in jax.random.split(jax.random.key(0), 3))
+        tasks = jax.vmap(lambda key, split=split: env.sample_task(key, split))(task_keys)
+        states = jax.vmap(env.reset)(scene_keys, tasks)
+        blind = [(0.0, jax.vmap(env.task_blind)(keys, tasks))] if name == "controller" else []
+        for noise, believed in [*((noise, tasks) for noise in NOISE), *blind]:
+            began = time.perf_counter()
+            act = functools.partial(perform, env, options=options, noise=noise)
+            visited, _ = map_in_chunks(act, (believed, states, keys), 256)
+            count = int(judge(env, tasks, visited)[0].sum())
+            row = {"split": split, "noise": noise, "task_blind": believed is not tasks, "success": count / scenes}
+            row |= {"wilson95": wilson_interval(count, scenes), "seconds": time.perf_counter() - began}
+            print(name, row, flush=True)
+            found.append(row)
+    return found
 
 
 def main(_: list[str]) -> None:
-    """Runs, prints and writes."""
-    found: list[dict[str, Any]] = []
-    for name, success in experts(_ITERATIONS.value).items():
-        for split in ("train", "validation"):
-            runs = {f"noise {noise}": (noise, False) for noise in NOISE}
-            runs |= {"task-blind": (0.0, True)} if name == "controller" else {}
-            for how, (noise, blind) in runs.items():
-                began = time.perf_counter()
-                count = int(success(split, _SCENES.value, noise, blind).sum())
-                row = {"expert": name, "split": split, "how": how, "seconds": time.perf_counter() - began}
-                rate = {"success": count / _SCENES.value, "wilson95": wilson_interval(count, _SCENES.value)}
-                found.append(row | rate)
-                print(f"{name}, {split}, {how}: {rate['success']:.1%}, {row['seconds']:.0f} s", flush=True)
-    contents = {"scenes": _SCENES.value, "iterations": _ITERATIONS.value, "experts": found}
-    path = pathlib.Path(_OUT.value)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    results.write_json(path, contents | provenance.describe())
+    """Runs what is missing."""
+    folder = pathlib.Path(_OUT.value)
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in _EXPERTS.value:
+        path = folder / f"push-{name}.json"
+        if not path.is_file():
+            contents = {"expert": name, "scenes": _SCENES.value, "ilqr_iterations": EXPERTS[name]}
+            results.write_json(path, contents | {"runs": compare(name, _SCENES.value)} | provenance.describe())
 
 
 if __name__ == "__main__":

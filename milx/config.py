@@ -87,8 +87,8 @@ class NetworkConfig:
         heads: 1, or 2 for a separate output layer in the inner loss.
         goal_head: predict where the episode ends, from the image, or from the state where the policy sees no pixels,
             and show the prediction to the layers after it (`milx.networks.goal`).
-        hindsight_head: where a demonstration is video alone, learn to tell from its first and last image where the
-            robot went, as the goal head is to see before it goes there, and let that be the goal in the inner step.
+        hindsight_head: where a demonstration is video alone, learn to tell from its first and last image what the goal
+            head is to see in the first, and let that be the goal in the inner step.
         learned_loss: MIL's inner loss where demonstrations show no actions (`mil.given`): "linear", or "temporal" with
             convolutions over time (`milx.networks.learned_loss`); None where they show them.
         context: size of the vector that methods without adaptation keep of a demonstration: units of the LSTM.

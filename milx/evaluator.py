@@ -118,7 +118,7 @@ def baselines(env: Env, demos: DemoSet, config: EvalConfig, expert: DataConfig, 
     """What random actions, the task-blind expert and the expert reach in the same trials.
 
     They run in the first `config.baseline_trials` of every task's trials. The task-blind expert goes to a random
-    candidate; the expert runs its plan without noise.
+    candidate; the expert does without noise what it planned or rehearsed.
     """
     num_trials = min(config.baseline_trials, config.trials)
     scene = trial_scenes(env, demos.task, jax.random.split(key)[0], config.trials)

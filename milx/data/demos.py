@@ -84,9 +84,7 @@ def collect(
         if parts is None:
             return make()
         path = parts.with_name(f"{parts.name}-{next(numbers)}.npz")
-        like = shapes(env, 1, len(key))
-        like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), (like.states, like.action))
-        return pytrees.kept(path, make, lambda: like)
+        return pytrees.kept(path, make, lambda: _of_one_task(shapes(env, 1, len(key))))
 
     states, action = map_in_chunks(plan_part, tuple(inputs), config.plan_batch)
     success, _ = map_in_chunks(functools.partial(judge, env), (inputs[0], states), config.plan_batch)
@@ -97,6 +95,10 @@ def collect(
     order = jnp.argsort(~success, axis=1)
     rows = jnp.arange(num_tasks)[:, None]
     return DemoSet(tasks, *jax.tree.map(lambda x: x[rows, order], (states, action, success)))
+
+
+def _of_one_task(demos: DemoSet) -> tuple[State, jax.Array]:
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), (demos.states, demos.action))
 
 
 def _without_diverged(states: State, action: jax.Array, success: jax.Array) -> tuple[State, jax.Array, jax.Array]:
@@ -215,7 +217,7 @@ def shapes(env: Env, num_tasks: int, num_demos: int) -> DemoSet:
     key = jax.random.key(0)
     task = jax.eval_shape(lambda key: env.sample_task(key, "train"), key)
     state = jax.eval_shape(env.reset, key, task)
-    action, success = jax.ShapeDtypeStruct((env.action_size,), jnp.float32), jax.ShapeDtypeStruct((), jnp.bool_)
+    action, success = (jax.ShapeDtypeStruct(*x) for x in (((env.action_size,), state.qpos.dtype), ((), jnp.bool_)))
     return DemoSet(
         expand(task, num_tasks),
         expand(state, num_tasks, num_demos, env.horizon + 1),

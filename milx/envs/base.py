@@ -68,7 +68,8 @@ class Env(abc.ABC):
         height_index: the entry that tells how high its hand is, where it must come down to an object; None otherwise.
         vision: whether the policy sees the image; if not, the state tells it where the objects are.
         object_indices: [O][2] entries of the state with each object's place, where the state tells them.
-        tactics: what the controller can be told, a number; who demonstrates tries them in this order.
+        tactics: ways in which the controller may go about a scene, in the order of preference; what the numbers mean is
+            the controller's affair.
     """
 
     name: str

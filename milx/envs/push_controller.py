@@ -17,7 +17,7 @@ LIFTED = 0.06
 MARGIN = 0.03
 """Gap between hand and object when the hand comes down (m)."""
 SIDE = 0.035
-"""The hand is behind the object if it is less than this off the line from the goal through the object (m)."""
+"""The hand is behind the object if it is less than this off the line along which it is to push (m)."""
 NEAR = 0.025
 """The hand comes down when it is closer than this to its place behind the object (m)."""
 ARRIVED, BEYOND = 0.03, 0.03

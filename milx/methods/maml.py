@@ -65,7 +65,7 @@ class MIL(Method):
         network: the policy network.
         goal_indices: entries of the state that the goal head predicts.
         image_to_goal: [3, G] from (x, y, 1), x and y in [-1, 1] across and down the image, to those entries, to start
-            the goal head from; None without one, or if it must learn that by itself.
+            the goal heads from; None without one, or if they must learn that by themselves.
     """
 
     config: MILConfig
@@ -85,7 +85,7 @@ class MIL(Method):
     def adapt(self, params: Params, demo: Demo) -> Params:
         """Takes the inner gradient steps (eq. 1) on demonstrations [K, T, ...]: their gradients are averaged."""
         theta, demo = params["policy"], shown(demo, self.config.given, params["whitening"])
-        demo = self._with_seen_goal(params, demo)
+        demo = self._with_goal_in_hindsight(params, demo)
         rates = jax.tree.map(lambda _: self.config.inner_lr, theta)
         if self.config.learn_inner_lr:
             rates = jax.tree.map(lambda s: self.config.inner_lr * jnp.exp(s), params["inner_log_lr"])
@@ -102,7 +102,10 @@ class MIL(Method):
         return {"policy": params["policy"], "whitening": params["whitening"]}
 
     def loss(self, params: Params, batch: TaskBatch) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """The meta-objective (eq. 3), averaged over the tasks; and its parts, [N] of each task."""
+        """The meta-objective (eq. 3), averaged over the tasks; and its parts, [N] of each task.
+
+        A hindsight head learns from the queries beside it, unadapted, as the inner step uses it.
+        """
 
         def task_loss(support: Demo, query: Demo) -> tuple[jax.Array, dict[str, jax.Array]]:
             adapted = self.adapt(params, support)
@@ -132,22 +135,25 @@ class MIL(Method):
             loss += self.config.goal_weight * goal_loss(output.goal, demo.goal, whitening, self.goal_indices)
         return loss
 
-    def _with_seen_goal(self, params: Params, demo: Demo) -> Demo:
-        """Video alone gets a goal for its first image, as if given: the hindsight head's."""
+    def _with_goal_in_hindsight(self, params: Params, demo: Demo) -> Demo:
+        """Video alone gets a goal for its first image, as if given: the hindsight head's.
+
+        In training it is the first image that was drawn (`train.support_frames`), which may show the hand on its way.
+        """
         if self.network.hindsight is None:
             return demo
         whitening, indices = params["whitening"], jnp.array(self.goal_indices, int)
         goal = self._in_hindsight(params["policy"], whitening, demo).mean
         goal = whitening.state_mean[indices] + whitening.state_scale[indices] * goal
         unknown = jnp.full((*demo.state.shape[:2], len(indices)), jnp.nan)
-        return dataclasses.replace(demo, goal=unknown.at[:, 0].set(jax.lax.stop_gradient(goal)))
+        return dataclasses.replace(demo, goal=unknown.at[:, 0].set(goal))
 
     def _in_hindsight(self, theta: Params, whitening: Whitening, demo: Demo) -> Goal:
         """Where the robot went in each of the demonstrations [K, T, ...], by their first and last images."""
         ends = jax.tree.map(lambda x: x[:, jnp.array([0, -1])], demo)
-        seen = self._apply(theta, whitening, ends).seen
-        assert self.network.hindsight is not None and seen is not None
-        return self.network.hindsight(theta, seen.reshape(len(demo.state), 2, *seen.shape[1:]))
+        maps = self._apply(theta, whitening, ends).feature_map
+        assert self.network.hindsight is not None and maps is not None
+        return self.network.hindsight(theta, maps.reshape(len(demo.state), 2, *maps.shape[1:]))
 
     def _apply(self, theta: Params, whitening: Whitening, demo: Demo) -> PolicyOutput:
         """What the network says of all time steps of demonstrations [K, T, ...], one after the other."""

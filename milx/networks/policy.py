@@ -21,26 +21,26 @@ class PolicyOutput(NamedTuple):
         action: [B, A] of the head that acts, in the network's units.
         inner_action: [B, A] of the head that the inner loss sees; the same head if there is only one.
         goal: where the episode will end; None without a goal head.
-        seen: [B, H, W, C] what the convolutions make of the image; None where the policy sees no pixels.
+        feature_map: [B, H, W, C] what the convolutions make of the image; None where the policy sees no pixels.
         features: [B, F] what the last layer sees.
     """
 
     action: jax.Array
     inner_action: jax.Array
     goal: Goal | None
-    seen: jax.Array | None
+    feature_map: jax.Array | None
     features: jax.Array
 
 
 class PolicyNetwork(NamedTuple):
-    """The network as a pair of pure functions.
+    """The network as pure functions.
 
     Attributes:
         init: key -> params.
         apply: (params, image [B, H, W, 3] uint8 or None, whitened state [B, S]) -> PolicyOutput.
         learned_loss: (params, features [K, T, F]) -> [K], the loss of demonstrations without actions; None without one.
-        hindsight: (params, what the convolutions make of videos [K, T, H, W, C]) -> Goal, where the robot went in each;
-            None without such a head.
+        hindsight: (params, feature maps of videos [K, T, H, W, C]) -> Goal, where the robot went in each; None without
+            such a head.
     """
 
     init: Callable[[jax.Array], Params]
@@ -104,7 +104,7 @@ class Controller(nn.Module):
         for size in config.fc_layers:
             x = Dense(size, hidden=True, norm=config.fc_norm, init_std=config.fc_init_std)(x)
         heads = [Dense(self.action_size, init_std=config.fc_init_std)(x) for _ in range(config.heads)]
-        return PolicyOutput(action=heads[-1], inner_action=heads[0], goal=goal, seen=features, features=x)
+        return PolicyOutput(action=heads[-1], inner_action=heads[0], goal=goal, feature_map=features, features=x)
 
 
 class _Policy(nn.Module):
@@ -147,7 +147,7 @@ def make_policy(
             start = loss.init(jax.random.fold_in(key, 1), output.features[None])
             params = {**params, "learned_loss": start["params"]}
         if config.hindsight_head:
-            start = head.init(jax.random.fold_in(key, 2), output.seen[None])
+            start = head.init(jax.random.fold_in(key, 2), output.feature_map[None])
             params = {**params, "hindsight": start["params"]}
         return params
 
@@ -161,8 +161,8 @@ def make_policy(
         assert isinstance(value, jax.Array)
         return value
 
-    def hindsight(params: Params, seen: jax.Array) -> Goal:
-        goal = head.apply({"params": params["hindsight"]}, seen)
+    def hindsight(params: Params, feature_maps: jax.Array) -> Goal:
+        goal = head.apply({"params": params["hindsight"]}, feature_maps)
         assert isinstance(goal, Goal)
         return goal
 

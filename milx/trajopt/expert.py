@@ -6,6 +6,8 @@ demonstration so shows how to recover, and its labels are clean (DART, Laskey et
 """
 
 import functools
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -29,8 +31,17 @@ def plan(env: Env, task: Task, state: State, options: Options) -> Plan:
     return solve(problem, state.vector, env.guess(task, state), options)
 
 
+Feedback = Callable[[State, jax.Array], jax.Array]
+"""Maps a state and the time step (int32 scalar) to an action [A]."""
+
+
+def follow(plan: Plan) -> Feedback:
+    """The plan's linear feedback."""
+    return lambda state, t: plan.actions[t] + plan.gains[t] @ (state.vector - plan.states[t])
+
+
 def demonstrate(
-    env: Env, task: Task, state: State, expert: Plan | jax.Array, key: jax.Array, noise: float
+    env: Env, task: Task, state: State, feedback: Feedback, key: jax.Array, noise: float
 ) -> tuple[State, jax.Array]:
     """Runs feedback from `state` with Gaussian noise of standard deviation `noise` on the actions.
 
@@ -38,7 +49,7 @@ def demonstrate(
         env: the environment.
         task: what is to be done.
         state: the scene.
-        expert: the plan whose feedback runs, or the tactic of the environment's controller.
+        feedback: who acts.
         key: draws the noise.
         noise: in units of the action.
 
@@ -47,66 +58,70 @@ def demonstrate(
     """
     low, high = env.action_range
 
-    def feedback(state: State, planned: tuple | None) -> jax.Array:
-        if not isinstance(expert, Plan):
-            return env.control(task, state, expert)
-        assert planned is not None
-        nominal_state, nominal_action, gain = planned
-        return nominal_action + gain @ (state.vector - nominal_state)
-
-    def step(state: State, inputs: tuple) -> tuple[State, tuple[State, jax.Array]]:
-        planned, key = inputs
-        action = jnp.clip(feedback(state, planned), low, high)
+    def step(state: State, inputs: tuple[jax.Array, jax.Array]) -> tuple[State, tuple[State, jax.Array]]:
+        t, key = inputs
+        action = jnp.clip(feedback(state, t), low, high)
         after = env.step(task, state, action + noise * jax.random.normal(key, action.shape))
         return after, (state, action)
 
     keys = jax.random.split(key, env.horizon)
-    planned = (expert.states[:-1], expert.actions, expert.gains) if isinstance(expert, Plan) else None
-    last, (states, actions) = jax.lax.scan(step, state, (planned, keys))
+    last, (states, actions) = jax.lax.scan(step, state, (jnp.arange(env.horizon), keys))
     return jax.tree.map(lambda xs, x: jnp.concatenate([xs, x[None]]), states, last), actions
 
 
 def perform(
     env: Env, task: Task, state: State, key: jax.Array, options: Options, noise: float
 ) -> tuple[State, jax.Array]:
-    """Plans and demonstrates a batch: `task`, `state` and `key` have a leading axis; so have the results."""
-    if options.iterations:
-        return _perform_planned(env, task, state, key, options, noise)
-    return _perform_controlled(env, task, state, key, choose_tactics(env, task, state, key), noise)
+    """Demonstrates a batch, as planned by iLQR or by the environment's controller. Not to be called inside `jax.jit`.
 
+    Args:
+        env: the environment.
+        task: [N] what is to be done.
+        state: [N] the scenes.
+        key: [N] draw the noise.
+        options: of iLQR; with no iterations the controller acts.
+        noise: standard deviation of the noise, in units of the action.
 
-def choose_tactics(env: Env, task: Task, state: State, key: jax.Array) -> np.ndarray:
-    """[N] the first tactic with which the environment's controller succeeds in a rehearsal of each scene of a batch.
+    Returns:
+        As `demonstrate`, with a leading axis [N].
 
-    Rehearsals are without noise. Where no tactic succeeds it is the first of all.
+    Raises:
+        ValueError: for no iterations in an environment without a controller.
     """
-    every = [np.full(len(key), tactic) for tactic in env.tactics]
+    if options.iterations:
+        return _perform_planned(env, options, noise, task, state, key)
+    return _perform_controlled(env, noise, task, state, choose_tactics(env, task, state), key)
+
+
+def choose_tactics(env: Env, task: Task, state: State) -> np.ndarray:
+    """[N] the first tactic with which the controller succeeds in a rehearsal of each of N scenes, without noise.
+
+    Where no tactic succeeds it is the first of all.
+    """
+    scenes = len(state.qpos)
+    every = [np.full(scenes, tactic) for tactic in env.tactics]
     if len(every) == 1:
         return every[0]
-    rehearsals = (_perform_controlled(env, task, state, key, each, 0.0)[0] for each in every)
+    keys = jax.random.split(jax.random.key(0), scenes)  # of noise that is multiplied by zero
+    rehearsals = (_perform_controlled(env, 0.0, task, state, each, keys)[0] for each in every)
     success = [np.asarray(judge(env, task, states)[0]) for states in rehearsals]
     return np.array(env.tactics)[np.argmax(success, axis=0)]
 
 
-@functools.partial(jax.jit, static_argnums=(0, 4))
-def _perform_planned(
-    env: Env, task: Task, state: State, key: jax.Array, options: Options, noise: float
-) -> tuple[State, jax.Array]:
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _perform_planned(env: Env, options: Options, noise: float, *batch: Any) -> tuple[State, jax.Array]:
     def one(noise: float, task: Task, state: State, key: jax.Array) -> tuple[State, jax.Array]:
-        return demonstrate(env, task, state, plan(env, task, state, options), key, noise)
+        return demonstrate(env, task, state, follow(plan(env, task, state, options)), key, noise)
 
-    return parallel.split_tasks(jax.vmap(one, in_axes=(None, 0, 0, 0)), shared=1)(noise, task, state, key)
+    return parallel.split_tasks(jax.vmap(one, in_axes=(None, 0, 0, 0)), shared=1)(noise, *batch)
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _perform_controlled(
-    env: Env, task: Task, state: State, key: jax.Array, tactic: np.ndarray, noise: float
-) -> tuple[State, jax.Array]:
+def _perform_controlled(env: Env, noise: float, *batch: Any) -> tuple[State, jax.Array]:
     def one(noise: float, task: Task, state: State, tactic: jax.Array, key: jax.Array) -> tuple[State, jax.Array]:
-        return demonstrate(env, task, state, tactic, key, noise)
+        return demonstrate(env, task, state, lambda state, _: env.control(task, state, tactic), key, noise)
 
-    in_axes = (None, 0, 0, 0, 0)
-    return parallel.split_tasks(jax.vmap(one, in_axes=in_axes), shared=1)(noise, task, state, tactic, key)
+    return parallel.split_tasks(jax.vmap(one, in_axes=(None, 0, 0, 0, 0)), shared=1)(noise, *batch)
 
 
 @functools.partial(jax.jit, static_argnums=0)

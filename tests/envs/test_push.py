@@ -104,19 +104,41 @@ def test_an_episode_of_pushing_is_that_of_mujoco(env, task, touched):
 @pytest.fixture(scope="module")
 def shown(env):
     """Tasks, and demonstrations of them by the controller with noise on its actions."""
-    keys = jax.random.split(jax.random.key(8), 32)
-    tasks = jax.vmap(env.sample_task, in_axes=(0, None))(keys, "train")
-    scenes = jax.vmap(env.reset)(jax.random.split(jax.random.key(9), len(keys)), tasks)
+    tasks = jax.vmap(env.sample_task, in_axes=(0, None))(jax.random.split(jax.random.key(8), 32), "train")
+    scenes, keys = scenes_of(env, tasks)
     return tasks, *perform(env, tasks, scenes, keys, Options(iterations=0), 0.1)
 
 
-def test_the_controller_pushes_almost_all_objects_to_the_goal_in_spite_of_noise(env, shown):
+def scenes_of(env, tasks):
+    """A scene of each task, and a key for its noise."""
+    keys = jax.random.split(jax.random.key(9), len(tasks.target))
+    return jax.vmap(env.reset)(keys, tasks), keys
+
+
+def test_the_controller_pushes_most_objects_to_the_goal_in_spite_of_noise(env, shown):
     tasks, states, _ = shown
     assert jax.jit(jax.vmap(env.success))(tasks, states).mean() > 0.9
 
 
+def test_a_tactic_is_how_far_to_the_side_of_the_objects_centre_the_hand_meets_it(env, shown, monkeypatch):
+    """To the left, as the hand looks at the goal. Of 32 means, on an arm shaken by noise, 4 mm are three deviations."""
+    tasks, _, _ = shown
+    scenes, keys = scenes_of(env, tasks)
+    rows, met = np.arange(len(keys)), []
+    for tactic in (0.02, -0.02):
+        monkeypatch.setattr(env, "tactics", (tactic,))
+        states, _ = perform(env, tasks, scenes, keys, Options(iterations=0), 0.1)
+        objects = np.asarray(jax.vmap(jax.vmap(env.objects))(states))[rows, :, tasks.target]
+        moved = np.argmax(np.linalg.norm(np.diff(objects, axis=1), axis=-1) > 1e-4, axis=1)
+        tip = np.asarray(jax.vmap(jax.vmap(env.robot_state))(states))[rows, moved, 14:16]
+        place = objects[rows, moved, :2]
+        ahead = -place / np.linalg.norm(place, axis=-1, keepdims=True)
+        met.append(np.sum(np.stack([-ahead[:, 1], ahead[:, 0]], axis=-1) * (tip - place), axis=-1))
+    np.testing.assert_allclose(np.mean(met, axis=1), (0.02, -0.02), atol=0.004)
+
+
 def test_demonstrations_record_the_controllers_answers_before_the_noise(env, shown):
-    tasks, states, action = jax.tree.map(lambda x: x[:3], shown)
+    tasks, states, action = shown
     before = jax.tree.map(lambda x: x[:, :-1], states)
     answers = jax.jit(jax.vmap(jax.vmap(jax.vmap(env.control, (None, None, 0)), (None, 0, None)), (0, 0, None)))
     off = np.abs(answers(tasks, before, jnp.array(env.tactics)) - action[:, :, None]).max(axis=(1, 3))

@@ -201,7 +201,10 @@ def test_demonstrations_that_show_too_little_are_refused(vision, given, learned,
         methods.make(config, spec)
 
 
-@pytest.mark.parametrize(("name", "given", "goal_head"), [("contextual", "video", True), ("mil", "video", False)])
+@pytest.mark.parametrize(
+    ("name", "given", "goal_head"),
+    [("contextual", "video", True), ("mil", "video", False), ("mil", "video+state", True)],
+)
 def test_a_hindsight_head_without_use_is_refused(name, given, goal_head):
     spec = methods.Spec((32, 40), STATE, ACTION, ((-1.0,) * ACTION, (1.0,) * ACTION), goal_indices=(1,))
     network = NetworkConfig(learned_loss="linear", goal_head=goal_head, hindsight_head=True)

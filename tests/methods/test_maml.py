@@ -97,6 +97,10 @@ VARIANTS = {
         {"learned_loss": "linear", "goal_head": True},
         {"given": "video+state", "goal_weight": 0.7},
     ),
+    "hindsight, unadapted": (
+        {"learned_loss": "linear", "goal_head": True, "hindsight_head": True},
+        {"given": "video", "goal_weight": 0.7, "inner_lr": 0.0},
+    ),
     "learned loss over time, two steps": ({"learned_loss": "temporal"}, {"given": "video", "inner_steps": 2}),
 }
 
@@ -165,7 +169,7 @@ def test_no_gradient_reaches_the_whitening_and_adam_leaves_it(batch):
 CONSTANT = PolicyNetwork(
     init=lambda key: jnp.zeros(ACTION),
     apply=lambda theta, image, state: PolicyOutput(
-        *[jnp.broadcast_to(theta, (len(state), ACTION))] * 2, goal=None, seen=None, features=state
+        *[jnp.broadcast_to(theta, (len(state), ACTION))] * 2, goal=None, feature_map=None, features=state
     ),
 )
 THETA = np.array([0.4, -1.3])
@@ -235,23 +239,30 @@ def test_closed_form_of_the_clipped_step(constant_case):
 
 
 def test_a_video_teaches_the_goal_that_hindsight_sees_in_its_first_and_last_image(batch):
-    """One vote, theta, of deviation one: the inner gradient is the vote minus that goal, whatever the states are."""
+    """One vote, theta, of deviation one: the inner gradient is the vote minus that goal, whatever the states are.
+
+    The head sees with unadapted parameters in the inner step and in the loss.
+    """
     corner = lambda image: image[..., 0, 0, :2] / 255.0  # noqa: E731
     network = PolicyNetwork(
         init=CONSTANT.init,
         apply=lambda theta, image, state: CONSTANT.apply(theta, image, state)._replace(
-            goal=Goal(jnp.zeros((len(state), 1)), theta[None], jnp.zeros(())), seen=corner(image)[:, None, None]
+            goal=Goal(jnp.zeros((len(state), 1)), theta[None], jnp.zeros(())), feature_map=corner(image)[:, None, None]
         ),
         learned_loss=lambda theta, features: jnp.zeros(len(features)),
-        hindsight=lambda theta, seen: Goal(
-            jnp.zeros((len(seen), 1)), (seen[:, 0] + 3 * seen[:, -1])[:, 0], jnp.asarray(-0.2)
+        hindsight=lambda theta, maps: Goal(
+            jnp.zeros((len(maps), 1)), theta + (maps[:, 0] + 3 * maps[:, -1])[:, 0], jnp.asarray(-0.2)
         ),
     )
     config = MILConfig(inner_lr=ALPHA, goal_weight=0.7, inner_clip=NO_CLIP, given="video")
     method = MIL(config, network, GOAL_INDICES)
     params = {"policy": jnp.asarray(THETA), "whitening": random_whitening(np.random.default_rng(4))}
     support = jax.tree.map(lambda x: x[0], batch.support)
-    goal = lambda demo: np.asarray(corner(demo.image[..., 0, :, :, :]) + 3 * corner(demo.image[..., -1, :, :, :]))  # noqa: E731
+
+    def goal(demo):
+        first, last = (np.asarray(corner(demo.image[..., t, :, :, :])) for t in (0, -1))
+        return THETA + first + 3 * last
+
     adapted = method.adapt(params, support)["policy"]
     np.testing.assert_allclose(adapted, THETA - ALPHA * 0.7 * (THETA - goal(support)[0]), rtol=1e-12)
 
@@ -387,10 +398,11 @@ def test_several_demonstrations_give_the_average_of_their_steps():
 NOT_SEEN = {"video+state": ("action",), "video": ("action", "state", "goal")}
 
 
-@pytest.mark.parametrize("given", NOT_SEEN)
-def test_what_is_not_given_of_a_demonstration_does_not_matter(batch, given):
+@pytest.mark.parametrize(("given", "hindsight"), [("video+state", False), ("video", False), ("video", True)])
+def test_what_is_not_given_of_a_demonstration_does_not_matter(batch, given, hindsight):
     """Nor need it be there; all else matters, in the inner step of a learned loss as in a context."""
-    method, params = build({"learned_loss": "linear", "goal_head": True}, given=given, goal_weight=0.7)
+    network = {"learned_loss": "linear", "goal_head": True, "hindsight_head": hindsight}
+    method, params = build(network, given=given, goal_weight=0.7)
     demo, other = (jax.tree.map(lambda x, n=n: x[n], batch.support) for n in range(2))
     adapt = jax.jit(method.adapt)
     adapted = adapt(params, demo)

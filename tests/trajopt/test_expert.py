@@ -33,7 +33,8 @@ def demonstrations(env):
         task = env.sample_task(task_key, "train")
         start = env.reset(scene_key, task)
         plan = expert.plan(env, task, start, Options(iterations=10))
-        states, actions = jax.vmap(lambda noise: expert.demonstrate(env, task, start, plan, noise_key, noise))(
+        follow = expert.follow(plan)
+        states, actions = jax.vmap(lambda noise: expert.demonstrate(env, task, start, follow, noise_key, noise))(
             jnp.array([0.0, NOISE])
         )
         success = jax.vmap(env.success, in_axes=(None, 0))(task, states)
@@ -118,6 +119,6 @@ def test_the_controller_gets_the_first_tactic_that_succeeds_in_rehearsal():
     x, y, _ = np.moveaxis(scenes.mocap_pos[:, 0], -1, 0)
     expected = np.where(x < 0.1, np.where(y > 0, 0.3, -0.3), 0.0)
     assert set(np.unique(expected)) == {-0.3, 0.0, 0.3}
-    np.testing.assert_array_equal(expert.choose_tactics(env, tasks, scenes, keys), expected)
+    np.testing.assert_array_equal(expert.choose_tactics(env, tasks, scenes), expected)
     _, action = expert.perform(env, tasks, scenes, keys, Options(iterations=0), NOISE)
     np.testing.assert_allclose(action[..., 0], np.broadcast_to(expected[:, None], action.shape[:2]), rtol=1e-6)
