@@ -40,6 +40,7 @@ def make_policy(method="mil", **mil):
     config.env.image_shape = (16, 20)
     config.network.filters, config.network.strides, config.network.fc_layers = (4, 4), (2, 2), (16,)
     config.network.learned_loss = "linear" if mil.get("given", "") not in ("", "video+state+action") else None
+    config.network.hindsight_head = mil.get("given") == "video"
     for name, value in mil.items():
         setattr(config.mil, name, value)
     spec = spec_of(env)
@@ -50,8 +51,8 @@ def make_policy(method="mil", **mil):
 
 @pytest.mark.parametrize(
     ("arguments", "shots"),
-    [({}, 1), ({"given": "video", "inner_steps": 2}, 1), ({"method": "lstm"}, 2)],
-    ids=["mil", "from video alone", "lstm, two shots"],
+    [({}, 1), ({"given": "video", "inner_steps": 2}, 2), ({"method": "lstm"}, 2)],
+    ids=["mil", "from two videos alone, in hindsight", "lstm, two shots"],
 )
 def test_another_process_gets_the_same_actions(tmp_path, arguments, shots):
     policy, rng = make_policy(**arguments), np.random.default_rng(0)
