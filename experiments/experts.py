@@ -7,7 +7,6 @@ Training and validation scenes, without and with noise on the actions. A plan's 
 trajectory; the controller answers to where the object is. What has its file is not run again.
 """
 
-import functools
 import pathlib
 import time
 from typing import Any
@@ -16,10 +15,9 @@ import jax
 from absl import app, flags
 
 from milx import envs, provenance, results
-from milx.chunks import map_in_chunks
-from milx.evaluator import wilson_interval
-from milx.trajopt.expert import judge, perform
-from milx.trajopt.ilqr import Options
+from milx.config import DataConfig, EvalConfig
+from milx.data.demos import collect
+from milx.evaluator import baselines, wilson_interval
 
 EXPERTS = {"controller": 0, "one-tactic": 0, "ilqr": 5}
 """By name, the most iterations of iLQR."""
@@ -31,28 +29,31 @@ _SCENES = flags.DEFINE_integer("scenes", 512, "Scenes of each split, each of ano
 
 
 def compare(name: str, scenes: int) -> list[dict[str, Any]]:
-    """Success of an expert for each split and noise; of the controller also blind to the task.
+    """Success of an expert for each split and noise, with floors beside the controller's.
 
     The seconds of the first entry include compilation.
     """
-    env, options = envs.make("push", (16, 16)), Options(iterations=EXPERTS[name])
+    env, key, found = envs.make("push", (16, 16)), jax.random.key(0), []
     if name == "one-tactic":
         env.tactics = env.tactics[:1]
-    found = []
     for split in ("train", "validation"):
-        task_keys, scene_keys, keys = (jax.random.split(key, scenes) for key in jax.random.split(jax.random.key(0), 3))
-        tasks = jax.vmap(lambda key, split=split: env.sample_task(key, split))(task_keys)
-        states = jax.vmap(env.reset)(scene_keys, tasks)
-        blind = [(0.0, jax.vmap(env.task_blind)(keys, tasks))] if name == "controller" else []
-        for noise, believed in [*((noise, tasks) for noise in NOISE), *blind]:
+        for noise in NOISE:
             began = time.perf_counter()
-            act = functools.partial(perform, env, options=options, noise=noise)
-            visited, _ = map_in_chunks(act, (believed, states, keys), 256)
-            count = int(judge(env, tasks, visited)[0].sum())
-            row = {"split": split, "noise": noise, "task_blind": believed is not tasks, "success": count / scenes}
-            row |= {"wilson95": wilson_interval(count, scenes), "seconds": time.perf_counter() - began}
-            print(name, row, flush=True)
-            found.append(row)
+            config = DataConfig(noise=noise, plan_iterations=EXPERTS[name], plan_batch=256)
+            demos = collect(env, key, split, scenes, 1, config)
+            count = int(demos.success.sum())
+            row = {
+                "split": split,
+                "noise": noise,
+                "success": count / scenes,
+                "wilson95": wilson_interval(count, scenes),
+            }
+            found.append(row | {"seconds": time.perf_counter() - began})
+            print(name, found[-1], flush=True)
+        if name == "controller":
+            floors = baselines(env, demos, EvalConfig(trials=1, baseline_trials=1, batch=128), config, key)
+            found[-1]["baselines"] = floors.success
+            print(name, split, floors.success, flush=True)
     return found
 
 
