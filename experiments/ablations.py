@@ -16,7 +16,7 @@ from milx.config import Config
 
 ABLATIONS: dict[str, dict[str, Any]] = {
     "as it is": {},
-    "5 shots at test": {"evaluation.shots": 5, "evaluation.batch": 30},
+    "5 shots at test": {"evaluation.shots": 5},
     "no bias transformation": {"network.bias_transformation": 0},
     "first order": {"mil.first_order": True},
     "fixed inner rate": {"mil.learn_inner_lr": False},

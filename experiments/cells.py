@@ -44,7 +44,7 @@ LEARNING_RATES = {
     "push": {"mil": 3e-3, "contextual": 3e-4, "lstm": 3e-4},
     "place": {"mil": 3e-3, "contextual": 3e-4, "lstm": 3e-4},
 }
-"""Peaks of the cosine, as `tune.py` found them on validation tasks; those of push and place are reach's."""
+"""Peaks of the cosine, as `tune.py` found them on validation tasks; those of place, and of MIL on push, are reach's."""
 
 
 def methods_of(env: str, chosen: list[str] | None) -> list[str]:

@@ -51,7 +51,6 @@ def configure(env: str, row: Row, shots: int, seed: int) -> Config:
     config = cells.configure(env, row.method, options.PRESET.value, seed, options.STEPS.value)
     config.train.redraw = True
     config.evaluation.shots = shots
-    config.evaluation.batch = max(config.evaluation.batch // shots, 1)
     for name, value in row.changes.items():
         config_lib.assign(config, name, value)
     return config

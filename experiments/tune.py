@@ -17,6 +17,7 @@ from milx.config import Config
 from milx.presets import make_config
 
 CANDIDATES = {
+    "1e-4": (1e-4, True),
     "3e-4": (3e-4, True),
     "1e-3": (1e-3, True),
     "3e-3": (3e-3, True),
@@ -44,7 +45,7 @@ def configure(env: str, method: str, candidate: str) -> Config:
 def main(_: list[str]) -> None:
     """Runs what is missing and prints a table."""
     folder = options.folder("tuning")
-    print("| environment | method | " + " | ".join(CANDIDATES) + " |", "|---|---|---|---|---|---|", sep="\n")
+    print(f"| environment | method | {' | '.join(CANDIDATES)} |", "|---" * (2 + len(CANDIDATES)) + "|", sep="\n")
     for env in _ENVS.value:
         runner = cells.Cells(folder, make_config(env, preset=options.PRESET.value).data.tasks)
         for method in cells.methods_of(env, _METHODS.value):

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from milx import parallel
-from milx.chunks import map_in_chunks
+from milx.chunks import map_in_chunks, map_in_groups
 from milx.config import Config, DataConfig, EvalConfig
 from milx.data.demos import DemoSet, render_demo, shapes
 from milx.envs.base import Env, State, Task
@@ -21,6 +21,9 @@ from milx.rollout import rollout
 from milx.trajopt.expert import judge, perform
 from milx.trajopt.ilqr import Options
 from milx.types import Params
+
+_PIXELS = 64_000_000
+"""Pixels of demonstrations that a device adapts to at once: an inner step keeps all activations for its gradient."""
 
 
 def wilson_interval(successes: int, trials: int, z: float = 1.959964) -> tuple[float, float]:
@@ -60,18 +63,24 @@ def _run_batch(
 ) -> Trials:
     """Adapts to demonstrations [N, K, T, ...], then lets the policy act from scenes [N, trials]."""
 
-    def run_task(params: Params, task: Task, states: State, action: jax.Array, scene: State, key: jax.Array) -> Trials:
-        demo = jax.vmap(functools.partial(render_demo, env, task))(states, action)
-        task_params = method.adapt(params, demo)
+    def run_tasks(params: Params, task: Task, states: State, action: jax.Array, scene: State, key: jax.Array) -> Trials:
+        def adapt(task: Task, states: State, action: jax.Array) -> Params:
+            return method.adapt(params, jax.vmap(functools.partial(render_demo, env, task))(states, action))
 
-        def trial(scene: State, key: jax.Array) -> Trials:
+        def trial(task_params: Params, task: Task, scene: State, key: jax.Array) -> Trials:
             visited, _ = rollout(env, method, task_params, task, scene, key)
             return Trials(env.success(task, visited), env.other_criteria(task, visited), visited)
 
-        return jax.vmap(trial)(scene, key)
+        task_params = map_in_groups(adapt, (task, states, action), _tasks_at_once(env, action))
+        return jax.vmap(jax.vmap(trial, in_axes=(None, None, 0, 0)))(task_params, task, scene, key)
 
-    run_tasks = jax.vmap(run_task, in_axes=(None, 0, 0, 0, 0, 0))
     return parallel.split_tasks(run_tasks, shared=1)(params, task, states, action, scene, key)
+
+
+def _tasks_at_once(env: Env, action: jax.Array) -> int:
+    """Of tasks with demonstrations [N, K, T, A]."""
+    shots, length = action.shape[1:3]
+    return _PIXELS // (shots * length * math.prod(env.image_shape)) if env.vision else len(action)
 
 
 def run_trials(env: Env, method: Method, params: Params, demos: DemoSet, config: EvalConfig, key: jax.Array) -> Trials:

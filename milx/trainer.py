@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import optax
 
 from milx import parallel
+from milx.chunks import map_in_groups
 from milx.config import OptimizerConfig, TrainConfig
 from milx.methods.base import Method
 from milx.types import Array, Params, TaskBatch
@@ -72,7 +73,7 @@ def meta_gradient(method: Method, params: Params, batch: TaskBatch) -> tuple[Par
     if at_once >= len(batch.query.action):
         return gradient(batch)
     one_task = lambda task: gradient(jax.tree.map(lambda x: x[None], task))  # noqa: E731
-    grad, metrics = jax.lax.map(one_task, batch, batch_size=max(1, at_once))
+    grad, metrics = map_in_groups(one_task, (batch,), at_once)
     return jax.tree.map(lambda x: x.mean(axis=0), grad), jax.tree.map(jnp.ravel, metrics)
 
 

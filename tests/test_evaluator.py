@@ -11,7 +11,7 @@ import scipy.stats
 from tiny import tiny_config
 
 from milx import evaluator, simulation
-from milx.chunks import map_in_chunks
+from milx.chunks import map_in_chunks, map_in_groups
 from milx.config import EvalConfig
 from milx.methods import Method
 
@@ -70,15 +70,28 @@ class Replay(Method):
         return jnp.zeros((), jnp.int32)
 
 
-def test_table_is_the_same_for_batches_of_two_and_three(trained):
-    env, method = trained.run.env, Replay()
-    key = jax.random.key(5)
-    config = EvalConfig(trials=24, shots=1, batch=3)
-    three = evaluator.run_trials(env, method, (), trained.test, config, key).success
-    two = evaluator.run_trials(env, method, (), trained.test, dataclasses.replace(config, batch=2), key).success
+def test_table_is_the_same_for_batches_of_two_and_three_and_for_tasks_adapted_one_by_one(trained, monkeypatch):
+    env, key, config = trained.run.env, jax.random.key(5), EvalConfig(trials=24, shots=1, batch=3)
+
+    def succeed(batch):
+        chosen = dataclasses.replace(config, batch=batch)
+        return evaluator.run_trials(env, Replay(), (), trained.test, chosen, key).success
+
+    three, two = succeed(3), succeed(2)
+    monkeypatch.setattr(evaluator, "_PIXELS", 1)
+    one_by_one = succeed(3)
     assert three.shape == (3, 24)
     assert 0 < three.mean() < 1, "replay succeeds by luck in some scenes"
     np.testing.assert_array_equal(two, three)
+    np.testing.assert_array_equal(one_by_one, three)
+
+
+@pytest.mark.parametrize(("shots", "pixels", "at_once"), [(2, 8000 * 3, 3), (2, 8000 * 3 - 1, 2), (1, 8000 * 3, 6)])
+def test_so_many_tasks_are_adapted_at_once_as_share_the_pixels(shots, pixels, at_once, monkeypatch):
+    monkeypatch.setattr(evaluator, "_PIXELS", pixels)
+    action = np.zeros((7, shots, 50, 2))
+    assert evaluator._tasks_at_once(types.SimpleNamespace(vision=True, image_shape=(8, 10)), action) == at_once
+    assert evaluator._tasks_at_once(types.SimpleNamespace(vision=False, image_shape=(8, 10)), action) == 7
 
 
 @pytest.mark.parametrize("split", ["validation", "test"])
@@ -162,6 +175,20 @@ def test_map_in_chunks_is_a_plain_call(total, size):
     found = map_in_chunks(function, inputs, size)
     assert shapes == [(size,)] * -(-total // size), "every call has the same size"
     jax.tree.map(np.testing.assert_array_equal, found, function(*inputs))
+
+
+@pytest.mark.parametrize(("total", "most", "groups"), [(6, 4, 2), (6, 6, 1), (6, 9, 1), (7, 4, 7), (4, 0, 4)])
+def test_map_in_groups_is_vmap_in_the_fewest_equal_groups(total, most, groups):
+    def function(key, x, empty):
+        return jax.random.randint(key, (2,), 0, 1000) + x, empty
+
+    # Some parameters have no entries.
+    inputs = jax.random.split(jax.random.key(0), total), jnp.arange(total), jnp.zeros((total, 0))
+    by_groups = jax.jit(lambda *inputs: map_in_groups(function, inputs, most))
+    for found, expected in zip(by_groups(*inputs), jax.vmap(function)(*inputs), strict=True):
+        np.testing.assert_array_equal(found, expected)
+    program = str(jax.make_jaxpr(by_groups)(*inputs))
+    assert (f"length={groups}" in program) if groups > 1 else ("scan" not in program)
 
 
 def test_map_in_chunks_takes_keys():
