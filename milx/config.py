@@ -286,7 +286,7 @@ def _build(cls: type, values: dict[str, Any], path: str) -> Any:
         raise ValueError(f"{path}: got {values!r}, expected a group of fields")
     unknown = sorted(set(values) - set(types))
     if unknown:
-        raise ValueError(f"{path}.{unknown[0]}: no such field, expected one of {', '.join(types)}")
+        raise ValueError(f"{path}: no such field {unknown[0]!r}, expected one of {', '.join(types)}")
     built = {}
     for name, value in values.items():
         if dataclasses.is_dataclass(types[name]):

@@ -46,8 +46,9 @@ def test_fields_left_out_have_their_defaults():
 @pytest.mark.parametrize(
     ("values", "message", "valid"),
     [
-        ({"nope": 1}, "config.nope: no such field", ["env_name", "seed", "train", "evaluation"]),
-        ({"train": {"stepz": 1}}, "config.train.stepz: no such field", ["steps", "meta_batch", "eval_every"]),
+        ({"nope": 1}, "config: no such field 'nope'", ["env_name", "seed", "train", "evaluation"]),
+        ({"train": {"stepz": 1}}, "config.train: no such field 'stepz'", ["steps", "meta_batch", "eval_every"]),
+        ({"train": {"&: 3": 1}}, "config.train: no such field '&: 3'", ["steps", "eval_every"]),
     ],
 )
 def test_unknown_field_is_refused_and_the_valid_ones_listed(values, message, valid):
