@@ -111,7 +111,7 @@ def test_demos():
         assert checked.action is None or (np.abs(checked.action) <= [1, 2]).all()
 
     check()
-    assert set(good) == set(GIVEN)
+    assert all(good.count(shown) > 3 for shown in GIVEN)
 
 
 @cases("observations")
