@@ -40,7 +40,7 @@ def map_in_groups(function: Callable[..., Any], inputs: tuple, most: int) -> Any
         most: of the entries of a group. Groups are N's largest divisor up to it, so a prime number goes one by one.
     """
     total = len(jax.tree.leaves(inputs)[0])
-    size = next(size for size in range(total, 0, -1) if total % size == 0 and (size <= most or size == 1))
+    size = max(size for size in range(1, total + 1) if total % size == 0 and size <= max(most, 1))
     if size == total:
         return jax.vmap(function)(*inputs)
     # By sizes that are said, as leaves without entries do not tell: jax.lax.map(batch_size=...) stumbles over them.
