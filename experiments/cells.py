@@ -4,10 +4,13 @@ Cells that differ only in seed and number of training tasks share every program:
 one larger set, repeated to its size, so that shapes stay the same.
 """
 
+import contextlib
 import dataclasses
+import hashlib
 import itertools
 import json
 import pathlib
+import shutil
 import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -16,15 +19,16 @@ import jax
 import jax.numpy as jnp
 
 from milx import config as config_lib
-from milx import envs, evaluator, methods, platform, pytrees, results
+from milx import envs, evaluator, guard, methods, platform, pytrees, results
+from milx.checkpoint import Checkpoints
 from milx.config import Config
 from milx.data import demos as demos_lib
 from milx.data.demos import DemoSet
 from milx.policy import spec_of
 from milx.presets import make_config
 from milx.simulation import split_demos, training_on, trial_key
-from milx.trainer import Trainer, make_optimizer
-from milx.training import check_steps, initial_state
+from milx.trainer import Trainer, TrainState, make_optimizer
+from milx.training import check_steps, initial_state, restore_state, save_state
 from milx.types import Params
 
 METHODS = {
@@ -95,6 +99,9 @@ class Trained(NamedTuple):
 class Cells:
     """Runs cells, each a configuration with a name, and keeps what later ones can use again.
 
+    A process that is killed leaves the checkpoint of its last validation in `unfinished/` beside the result files; the
+    next one goes on from there.
+
     Args:
         folder: where the result files are.
         capacity: tasks in the largest cell.
@@ -131,6 +138,8 @@ class Cells:
         for name, result in finished.items():
             self.write(name, result)
             print(f"{name}: {result['success']:.1%}, {result['wall_clock_s']['total']:.0f} s", flush=True)
+        for config in missing.values():
+            self.forget(config)
 
     def _run(self, name: str, config: Config) -> dict[str, Any]:
         clock = [time.perf_counter()]
@@ -158,6 +167,10 @@ class Cells:
         self.folder.mkdir(parents=True, exist_ok=True)
         results.write_json(self.folder / f"{name}.json", result)
 
+    def forget(self, config: Config) -> None:
+        """Deletes the checkpoints of a cell that has its file."""
+        shutil.rmtree(self._unfinished(config), ignore_errors=True)
+
     def train(self, name: str, config: Config) -> Trained:
         """Meta-trains a cell; what differs in its evaluation only is not trained again.
 
@@ -165,23 +178,40 @@ class Cells:
             ValueError: if the number of tasks does not divide the capacity, or the steps are not whole scans.
         """
         self._check(config)
-        return self._once(
-            ("trained", self._programs(config), config.seed, config.data.tasks), lambda: self._train(name, config)
-        )
+        folder = self._unfinished(config)
+
+        def train() -> Trained:
+            folder.mkdir(parents=True, exist_ok=True)
+            with guard.one_trainer(folder), contextlib.closing(Checkpoints(folder / "checkpoints")) as checkpoints:
+                return self._train(name, config, checkpoints)
+
+        return self._once(("trained", folder.name), train)
+
+    def _unfinished(self, config: Config) -> pathlib.Path:
+        """Where a cell's checkpoints are until it has its file, by all on which its training depends."""
+        contents = json.dumps([self._programs(config), config.seed, config.data.tasks, self.capacity])
+        return self.folder / "unfinished" / hashlib.sha256(contents.encode()).hexdigest()[:16]
 
     def _check(self, config: Config) -> None:
         if self.capacity % config.data.tasks:
             raise ValueError(f"data.tasks: got {config.data.tasks}, expected a divisor of {self.capacity}")
         check_steps(config)
 
-    def _train(self, name: str, config: Config) -> Trained:
+    def _train(self, name: str, config: Config, checkpoints: Checkpoints) -> Trained:
         env, trainer, every = self._env(config), self._trainer(config), config.train.log_every
         train = self._first_tasks(config)
         evaluation = dataclasses.replace(config.evaluation, shots=config.train.shots)
         validation = self._demos(dataclasses.replace(config, evaluation=evaluation), "validation")
         repeated = jax.tree.map(lambda x: jnp.concatenate([x] * (self.capacity // config.data.tasks)), train)
-        state, key = initial_state(trainer, config, training_on(env, config, repeated))
-        seconds, began = dict.fromkeys(("compile", "train", "evaluate"), 0.0), time.perf_counter()
+        training = training_on(env, config, repeated)
+        first, key = initial_state(trainer, config, training)
+
+        def restore(step: int) -> tuple[TrainState, dict[str, float]]:
+            return restore_state(checkpoints, step, first, training.dataset_hash)
+
+        state, seconds, began = first, dict.fromkeys(("compile", "train", "evaluate"), 0.0), time.perf_counter()
+        if checkpoints.latest is not None:
+            state, seconds = restore(checkpoints.latest)
 
         def lap(name: str) -> None:
             nonlocal began
@@ -195,7 +225,7 @@ class Cells:
             lambda: Trainer.run.lower(trainer, state, repeated, key, every).compile(options),
         )
         lap("compile")
-        best, step = (state.params, 0, -1.0), 0
+        step = int(state.step)
         while step < config.train.steps:
             state, metrics = compiled(state, repeated, key)
             step += every
@@ -207,8 +237,11 @@ class Cells:
                 success = float(trials.success.mean())
                 lap("evaluate")
                 print(f"  {name} {step}: loss {loss:.3f}, validation {success:.1%}", flush=True)
-                best = max(best, (state.params, step, success), key=lambda entry: entry[2])
-        return Trained(*best, seconds)
+                if not save_state(checkpoints.save, state, success, seconds, training.dataset_hash):
+                    raise ValueError(f"{checkpoints.folder}: the checkpoint of step {step} could not be written")
+        best = checkpoints.best
+        assert best is not None  # the last step has one
+        return Trained(restore(best)[0].params, best, checkpoints.score(best), seconds)
 
     def _trainer(self, config: Config) -> Trainer:
         env = self._env(config)

@@ -4,7 +4,7 @@
     python experiments/figure3.py --envs=push --tasks=48,192,768 --steps=15000 --out=results/figure3_push
     python experiments/figure3.py --preset=cpu --steps=200 --out=tiny --tasks=6,12 --seeds=1 --end_seeds=1
 
-Stopped and started again it goes on with the next cell.
+Stopped and started again it goes on with its last checkpoint.
 """
 
 import collections

@@ -3,7 +3,7 @@
     python experiments/table1.py                # what is missing, then the table; --show runs nothing
     python experiments/table1.py --rows=mil-video
 
-One row has four times the demonstrations. Stopped and started again it goes on with the next cell.
+One row has four times the demonstrations. Stopped and started again it goes on with its last checkpoint.
 """
 
 from typing import Any

@@ -2,7 +2,7 @@
 
     python experiments/table3.py            # what is missing, then the table
 
-Stopped and started again it goes on with the next cell.
+Stopped and started again it goes on with its last checkpoint.
 """
 
 import tables

@@ -25,7 +25,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from milx import config as config_lib
-from milx import guard, methods, parallel, platform, provenance, results
+from milx import guard, methods, parallel, platform, results
 from milx.checkpoint import UNVALIDATED, Checkpoints
 from milx.config import Config
 from milx.methods import Spec
@@ -33,7 +33,7 @@ from milx.metrics import MetricsWriter
 from milx.networks import fixed
 from milx.policy import params_like
 from milx.trainer import Sample, Trainer, TrainState, make_optimizer
-from milx.training import Training, check_steps, initial_state
+from milx.training import Training, check_steps, initial_state, restore_state, save_state
 from milx.types import Params
 
 MOST_IN_VAIN = 100
@@ -150,10 +150,7 @@ class Run(abc.ABC):
         metrics, written, step = MetricsWriter(self.folder, int(state.step), self._warn), True, int(state.step)
 
         def save(state: TrainState, score: float, write: Callable[..., bool]) -> bool:
-            items = {"params": state.params, "trainer": (state.step, state.optimizer)}
-            extra = {"seconds": self._elapsed(), "dataset_hash": training.dataset_hash}
-            extra["versions"] = provenance.versions(("milx", "jax", "orbax-checkpoint"))
-            return write(int(state.step), items, score if np.isfinite(score) else UNVALIDATED, extra)
+            return save_state(write, state, score, self._elapsed(), training.dataset_hash)
 
         def validate(state: TrainState) -> bool:
             """Gives a checkpoint its score; a signal meanwhile loses nothing but that."""
@@ -258,19 +255,8 @@ class Run(abc.ABC):
         """The state to train from, and the key of the batches."""
         state, batch_key = initial_state(self.trainer, self.config, training)
         if checkpoints.latest is not None:
-            like = {"params": state.params, "trainer": (state.step, state.optimizer)}
-            items, extra = checkpoints.restore(checkpoints.latest, like)
-            if extra["dataset_hash"] != training.dataset_hash:
-                old, new = extra["dataset_hash"][:12], training.dataset_hash[:12]
-                raise ValueError(
-                    f"workdir: {self.folder} was trained on demonstrations {old}, but there are {new} now; expected "
-                    "the data set, or the device and versions that planned them, with which the run began, or another "
-                    "folder"
-                )
-            self.seconds = extra["seconds"]
-            step, optimizer = items["trainer"]
-            state = TrainState(step, items["params"], optimizer)
-            self.console.print(f"continuing from step {int(step)}")
+            state, self.seconds = restore_state(checkpoints, checkpoints.latest, state, training.dataset_hash)
+            self.console.print(f"continuing from step {int(state.step)}")
         return state, batch_key
 
     def _claim_folder(self) -> None:

@@ -1,4 +1,4 @@
-"""What training starts from: data with their statistics, and the first parameters."""
+"""What training starts from, data with their statistics and the first parameters, and what it goes on from."""
 
 import dataclasses
 from collections.abc import Callable
@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from milx import provenance
+from milx.checkpoint import UNVALIDATED, Checkpoints
 from milx.config import Config
 from milx.networks import fixed
 from milx.trainer import Trainer, TrainState
@@ -48,3 +50,51 @@ def initial_state(trainer: Trainer, config: Config, training: Training) -> tuple
     else:
         filters = fixed.load(config.network.fixed_filters, config.network)
     return dataclasses.replace(state, params=fixed.put(state.params, filters)), batch_key
+
+
+def save_state(
+    write: Callable[..., bool], state: TrainState, score: float, seconds: dict[str, float], dataset_hash: str
+) -> bool:
+    """Writes a checkpoint from which `restore_state` goes on.
+
+    Args:
+        write: `Checkpoints.save` or `Checkpoints.replace`.
+        state: what training has come to.
+        score: of its validation, or UNVALIDATED.
+        seconds: wall-clock by part.
+        dataset_hash: of the training demonstrations.
+
+    Returns:
+        Whether it is written.
+    """
+    items = {"params": state.params, "trainer": (state.step, state.optimizer)}
+    extra = {"seconds": seconds, "dataset_hash": dataset_hash}
+    extra["versions"] = provenance.versions(("milx", "jax", "orbax-checkpoint"))
+    return write(int(state.step), items, score if np.isfinite(score) else UNVALIDATED, extra)
+
+
+def restore_state(
+    checkpoints: Checkpoints, step: int, state: TrainState, dataset_hash: str
+) -> tuple[TrainState, dict[str, float]]:
+    """The state of a checkpoint, and the seconds spent until then.
+
+    Args:
+        checkpoints: of the run.
+        step: which.
+        state: the run's first, for structure and shapes.
+        dataset_hash: of the demonstrations that there are now.
+
+    Raises:
+        ValueError: if the checkpoint was trained on other demonstrations.
+    """
+    like = {"params": state.params, "trainer": (state.step, state.optimizer)}
+    items, extra = checkpoints.restore(step, like)
+    if extra["dataset_hash"] != dataset_hash:
+        old, new = extra["dataset_hash"][:12], dataset_hash[:12]
+        raise ValueError(
+            f"workdir: {checkpoints.folder.parent} was trained on demonstrations {old}, but there are {new} now; "
+            "expected the data set, or the device and versions that planned them, with which the run began, or another "
+            "folder"
+        )
+    updates, optimizer = items["trainer"]
+    return TrainState(updates, items["params"], optimizer), extra["seconds"]

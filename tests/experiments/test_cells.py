@@ -7,15 +7,33 @@ import sys
 import pytest
 from tiny import tiny_config
 
+from milx.training import save_state
+
 sys.path.insert(0, str(pathlib.Path(__file__).parents[2] / "experiments"))
 import cells
 
 
 def test_a_cell_is_a_run(trained, tmp_path, monkeypatch):
-    """The same seeds, tasks and trials: the same success, demonstrations and baselines, to the last bit."""
+    """Same seeds, tasks and trials: the same success, demonstrations and baselines, to the last bit, killed or not."""
     monkeypatch.setattr(cells.envs, "make", lambda *_: trained.run.env)  # spares what is compiled for it
     runner, config = cells.Cells(tmp_path, trained.config.data.tasks), tiny_config()
+    saved = []
+
+    def killed(*args):
+        """Writes a checkpoint, and the first time the process ends right after it."""
+        written = save_state(*args)
+        saved.append(int(args[1].step))
+        if len(saved) == 1:
+            raise KeyboardInterrupt
+        return written
+
+    monkeypatch.setattr(cells, "save_state", killed)
+    with pytest.raises(KeyboardInterrupt):
+        runner.run({"cell": config})
     runner.run({"cell": config})
+    assert saved == [2, 4, 6]  # it has gone on from there
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["cell.json", "unfinished"]
+    assert not list((tmp_path / "unfinished").iterdir())
     result = cells.read(tmp_path)["cell"]
     for field in ("success", "trials", "wilson95", "baselines", "dataset_hash"):
         assert result[field] == trained.result[field], field
