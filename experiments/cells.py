@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 
 from milx import config as config_lib
-from milx import envs, evaluator, guard, methods, platform, pytrees, results
+from milx import envs, evaluator, guard, methods, platform, provenance, pytrees, results
 from milx.checkpoint import Checkpoints
 from milx.config import Config
 from milx.data import demos as demos_lib
@@ -27,8 +27,8 @@ from milx.data.demos import DemoSet
 from milx.policy import spec_of
 from milx.presets import make_config
 from milx.simulation import split_demos, training_on, trial_key
-from milx.trainer import Trainer, TrainState, make_optimizer
-from milx.training import check_steps, initial_state, restore_state, save_state
+from milx.trainer import Trainer, make_optimizer
+from milx.training import Training, check_steps, initial_state, restore_state, save_state
 from milx.types import Params
 
 METHODS = {
@@ -99,8 +99,8 @@ class Trained(NamedTuple):
 class Cells:
     """Runs cells, each a configuration with a name, and keeps what later ones can use again.
 
-    A process that is killed leaves the checkpoint of its last validation in `unfinished/` beside the result files; the
-    next one goes on from there.
+    A process that is killed leaves the checkpoint of its last validation in `unfinished/` beside the result files. The
+    next one goes on from there if all is the same: configuration, demonstrations, commit, hardware and versions.
 
     Args:
         folder: where the result files are.
@@ -110,6 +110,7 @@ class Cells:
     def __init__(self, folder: pathlib.Path, capacity: int):
         self.folder, self.capacity = folder, capacity
         self._made: dict[Any, Any] = {}
+        self._unneeded: list[pathlib.Path] = []
 
     def is_done(self, name: str, config: Config) -> bool:
         """Whether the cell has its file.
@@ -138,8 +139,7 @@ class Cells:
         for name, result in finished.items():
             self.write(name, result)
             print(f"{name}: {result['success']:.1%}, {result['wall_clock_s']['total']:.0f} s", flush=True)
-        for config in missing.values():
-            self.forget(config)
+        self.forget()
 
     def _run(self, name: str, config: Config) -> dict[str, Any]:
         clock = [time.perf_counter()]
@@ -167,51 +167,54 @@ class Cells:
         self.folder.mkdir(parents=True, exist_ok=True)
         results.write_json(self.folder / f"{name}.json", result)
 
-    def forget(self, config: Config) -> None:
-        """Deletes the checkpoints of a cell that has its file."""
-        shutil.rmtree(self._unfinished(config), ignore_errors=True)
+    def forget(self) -> None:
+        """Deletes the checkpoints of the cells trained so far, once they have their files."""
+        while self._unneeded:
+            shutil.rmtree(self._unneeded.pop())
 
     def train(self, name: str, config: Config) -> Trained:
         """Meta-trains a cell; what differs in its evaluation only is not trained again.
 
         Raises:
-            ValueError: if the number of tasks does not divide the capacity, or the steps are not whole scans.
+            ValueError: if the number of tasks does not divide the capacity, the steps are not whole scans, another
+                process trains this cell, or its last checkpoint could not be written.
         """
         self._check(config)
-        folder = self._unfinished(config)
-
-        def train() -> Trained:
-            folder.mkdir(parents=True, exist_ok=True)
-            with guard.one_trainer(folder), contextlib.closing(Checkpoints(folder / "checkpoints")) as checkpoints:
-                return self._train(name, config, checkpoints)
-
-        return self._once(("trained", folder.name), train)
-
-    def _unfinished(self, config: Config) -> pathlib.Path:
-        """Where a cell's checkpoints are until it has its file, by all on which its training depends."""
-        contents = json.dumps([self._programs(config), config.seed, config.data.tasks, self.capacity])
-        return self.folder / "unfinished" / hashlib.sha256(contents.encode()).hexdigest()[:16]
+        return self._once(
+            ("trained", self._programs(config), config.seed, config.data.tasks), lambda: self._train(name, config)
+        )
 
     def _check(self, config: Config) -> None:
         if self.capacity % config.data.tasks:
             raise ValueError(f"data.tasks: got {config.data.tasks}, expected a divisor of {self.capacity}")
         check_steps(config)
 
-    def _train(self, name: str, config: Config, checkpoints: Checkpoints) -> Trained:
+    def _train(self, name: str, config: Config) -> Trained:
+        times = self.capacity // config.data.tasks
+        repeated = jax.tree.map(lambda x: jnp.concatenate([x] * times), self._first_tasks(config))
+        training = training_on(self._env(config), config, repeated)
+        folder = self._unfinished(config, training.dataset_hash)
+        folder.mkdir(parents=True, exist_ok=True)
+        with guard.one_trainer(folder), contextlib.closing(Checkpoints(folder / "checkpoints")) as checkpoints:
+            trained = self._fit(name, config, training, checkpoints)
+        self._unneeded.append(folder)
+        return trained
+
+    def _unfinished(self, config: Config, dataset_hash: str) -> pathlib.Path:
+        """Where a cell's checkpoints are until it has its file: a folder for all on which they depend."""
+        contents = json.dumps([_contents(config), dataset_hash, provenance.describe()])
+        return self.folder / "unfinished" / hashlib.sha256(contents.encode()).hexdigest()[:16]
+
+    def _fit(self, name: str, config: Config, training: Training, checkpoints: Checkpoints) -> Trained:
         env, trainer, every = self._env(config), self._trainer(config), config.train.log_every
-        train = self._first_tasks(config)
         evaluation = dataclasses.replace(config.evaluation, shots=config.train.shots)
         validation = self._demos(dataclasses.replace(config, evaluation=evaluation), "validation")
-        repeated = jax.tree.map(lambda x: jnp.concatenate([x] * (self.capacity // config.data.tasks)), train)
-        training = training_on(env, config, repeated)
-        first, key = initial_state(trainer, config, training)
-
-        def restore(step: int) -> tuple[TrainState, dict[str, float]]:
-            return restore_state(checkpoints, step, first, training.dataset_hash)
-
-        state, seconds, began = first, dict.fromkeys(("compile", "train", "evaluate"), 0.0), time.perf_counter()
+        data = training.at(0)
+        state, key = initial_state(trainer, config, training)
+        seconds, began = dict.fromkeys(("compile", "train", "evaluate"), 0.0), time.perf_counter()
         if checkpoints.latest is not None:
-            state, seconds = restore(checkpoints.latest)
+            state, seconds = restore_state(checkpoints, checkpoints.latest, state, training.dataset_hash)
+            print(f"  {name}: goes on from step {int(state.step)}", flush=True)
 
         def lap(name: str) -> None:
             nonlocal began
@@ -222,12 +225,12 @@ class Cells:
         options = platform.pixel_options(env.chain)
         compiled = self._once(
             ("compiled", self._programs(config)),
-            lambda: Trainer.run.lower(trainer, state, repeated, key, every).compile(options),
+            lambda: Trainer.run.lower(trainer, state, data, key, every).compile(options),
         )
         lap("compile")
-        step = int(state.step)
+        step, written = int(state.step), True
         while step < config.train.steps:
-            state, metrics = compiled(state, repeated, key)
+            state, metrics = compiled(state, data, key)
             step += every
             if step % config.train.eval_every == 0 or step == config.train.steps:
                 loss = float(metrics["loss"])
@@ -237,11 +240,13 @@ class Cells:
                 success = float(trials.success.mean())
                 lap("evaluate")
                 print(f"  {name} {step}: loss {loss:.3f}, validation {success:.1%}", flush=True)
-                if not save_state(checkpoints.save, state, success, seconds, training.dataset_hash):
-                    raise ValueError(f"{checkpoints.folder}: the checkpoint of step {step} could not be written")
+                written = save_state(checkpoints.save, state, success, seconds, training.dataset_hash)
+                lap("evaluate")
         best = checkpoints.best
-        assert best is not None  # the last step has one
-        return Trained(restore(best)[0].params, best, checkpoints.score(best), seconds)
+        if best is None or not written:
+            raise ValueError(f"{checkpoints.folder}: the checkpoint of step {step} could not be written")
+        params = checkpoints.restore(best, {"params": state.params})[0]["params"]
+        return Trained(params, best, checkpoints.score(best), seconds)
 
     def _trainer(self, config: Config) -> Trainer:
         env = self._env(config)

@@ -57,7 +57,7 @@ def main(_: list[str]) -> None:
                     row: dict[str, Any] = {"env": env, "method": method, "candidate": candidate}
                     row |= {"validation_success": trained.validation, "wall_clock_s": trained.seconds}
                     runner.write(name, row | {"config": config_lib.to_dict(config)} | provenance.describe())
-                    runner.forget(config)
+                    runner.forget()
             found = cells.read(folder)
             shown = [f"{found[name]['validation_success']:.1%}" if name in found else "" for name in names.values()]
             print(f"| {env} | {method} | {' | '.join(shown)} |", flush=True)

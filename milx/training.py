@@ -85,7 +85,7 @@ def restore_state(
         dataset_hash: of the demonstrations that there are now.
 
     Raises:
-        ValueError: if the checkpoint was trained on other demonstrations.
+        ValueError: if the checkpoint was trained on other demonstrations, or does not hold this state.
     """
     like = {"params": state.params, "trainer": (state.step, state.optimizer)}
     items, extra = checkpoints.restore(step, like)

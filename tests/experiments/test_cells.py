@@ -30,6 +30,7 @@ def test_a_cell_is_a_run(trained, tmp_path, monkeypatch):
     monkeypatch.setattr(cells, "save_state", killed)
     with pytest.raises(KeyboardInterrupt):
         runner.run({"cell": config})
+    runner = cells.Cells(tmp_path, trained.config.data.tasks)  # as in another process
     runner.run({"cell": config})
     assert saved == [2, 4, 6]  # it has gone on from there
     assert sorted(path.name for path in tmp_path.iterdir()) == ["cell.json", "unfinished"]
