@@ -61,7 +61,7 @@ def save_state(
         write: `Checkpoints.save` or `Checkpoints.replace`.
         state: what training has come to.
         score: of its validation, or UNVALIDATED.
-        seconds: wall-clock by part.
+        seconds: wall-clock by part, in s.
         dataset_hash: of the training demonstrations.
 
     Returns:
