@@ -3,7 +3,7 @@
     python experiments/table1.py                # what is missing, then the table; --show runs nothing
     python experiments/table1.py --rows=mil-video
 
-One row has four times the demonstrations. Stopped and started again it goes on with its last checkpoint.
+One row has four times the tasks. Stopped and started again it goes on with its last checkpoint.
 """
 
 from typing import Any
@@ -54,7 +54,7 @@ def _rows() -> dict[str, Row]:
         if given != GIVEN[0]:
             add(f"mil-temporal-{name}", f"MIL with a temporal loss, {shown}", "mil", {"mil.given": given, **TEMPORAL})
     add("mil-hindsight-video", "MIL with a hindsight head, video", "mil", HINDSIGHT)
-    add("mil-four-times", "MIL, four times as many demonstrations", "mil", {"data.tasks": 3076})
+    add("mil-four-times", "MIL, video + state + action, four times as many tasks", "mil", {"data.tasks": 3076})
     return rows
 
 
