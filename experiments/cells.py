@@ -19,14 +19,15 @@ import jax
 import jax.numpy as jnp
 
 from milx import config as config_lib
-from milx import envs, evaluator, guard, methods, platform, provenance, pytrees, results
+from milx import envs, evaluator, guard, listening, methods, platform, provenance, pytrees, report, results
 from milx.checkpoint import Checkpoints
 from milx.config import Config
 from milx.data import demos as demos_lib
 from milx.data.demos import DemoSet
+from milx.metrics import MetricsWriter
 from milx.policy import spec_of
 from milx.presets import make_config
-from milx.simulation import split_demos, training_on, trial_key
+from milx.simulation import judge, split_demos, training_on, trial_key, validate
 from milx.trainer import Trainer, make_optimizer
 from milx.training import Training, check_steps, initial_state, restore_state, save_state
 from milx.types import Params
@@ -88,12 +89,14 @@ class Trained(NamedTuple):
         step: after how many meta-updates.
         validation: its success there.
         seconds: what compiling the training ("compile"; 0 if an earlier cell did), training and validating took.
+        curve: what every validation found, with the "step" and the training "loss".
     """
 
     params: Params
     step: int
     validation: float
     seconds: dict[str, float]
+    curve: list[dict[str, Any]]
 
 
 class Cells:
@@ -146,21 +149,20 @@ class Cells:
         env, method, evaluation = self._env(config), self._trainer(config).method, config.evaluation
         train, test = self._first_tasks(config), self._demos(config, "test")
         floors = self._once(
-            ("floors", config.env_name),
+            ("floors", config.env_name, config.env.action_cost),
             lambda: evaluator.baselines(env, test, evaluation, config.data, trial_key("test")),
         )
         clock.append(time.perf_counter())
         trained = self.train(name, config)
         clock.append(time.perf_counter())
-        trials = evaluator.run_trials(env, method, trained.params, test, evaluation, trial_key("test"))
-        found = evaluator.describe(env, config, trials, floors)
+        _, found = judge(env, method, trained.params, test, config, floors)
         clock.append(time.perf_counter())
         demos_s, _, evaluate_s = (later - earlier for earlier, later in itertools.pairwise(clock))
         seconds = {"demos": demos_s, **trained.seconds, "evaluate": trained.seconds["evaluate"] + evaluate_s}
         seconds["total"] = sum(seconds.values())
         digest = pytrees.fingerprint(train)
         result = results.describe(config, found, seconds, trained.step, digest)
-        return result | {"validation_success": trained.validation}
+        return result | {"validation_success": trained.validation, "curve": trained.curve}
 
     def write(self, name: str, result: dict[str, Any]) -> None:
         """Writes a cell's file."""
@@ -229,24 +231,27 @@ class Cells:
         )
         lap("compile")
         step, written = int(state.step), True
+        log = MetricsWriter(checkpoints.folder.parent, step, print)
         while step < config.train.steps:
             state, metrics = compiled(state, data, key)
             step += every
             if step % config.train.eval_every == 0 or step == config.train.steps:
                 loss = float(metrics["loss"])
                 lap("train")
-                key_of_trials = trial_key("validation")
-                trials = evaluator.run_trials(env, trainer.method, state.params, validation, evaluation, key_of_trials)
-                success = float(trials.success.mean())
+                success, heard = validate(env, trainer.method, state.params, validation, evaluation)
+                log.write(step, {"loss": loss, "validation_success": success, **heard})
                 lap("evaluate")
-                print(f"  {name} {step}: loss {loss:.3f}, validation {success:.1%}", flush=True)
+                said = listening.describe(heard)
+                print(f"  {name} {step}: loss {loss:.3f}, validation {success:.1%}{said}", flush=True)
                 written = save_state(checkpoints.save, state, success, seconds, training.dataset_hash)
                 lap("evaluate")
+        log.close()
         best = checkpoints.best
         if best is None or not written:
             raise ValueError(f"{checkpoints.folder}: the checkpoint of step {step} could not be written")
         params = checkpoints.restore(best, {"params": state.params})[0]["params"]
-        return Trained(params, best, checkpoints.score(best), seconds)
+        curve = report.read_metrics(checkpoints.folder.parent / "metrics.jsonl")
+        return Trained(params, best, checkpoints.score(best), seconds, curve)
 
     def _trainer(self, config: Config) -> Trainer:
         env = self._env(config)
@@ -256,8 +261,8 @@ class Cells:
         return self._once(("trainer", self._programs(config)), make)
 
     def _env(self, config: Config) -> envs.Env:
-        name, image_shape = config.env_name, config.env.image_shape
-        return self._once(("env", name, image_shape), lambda: envs.make(name, image_shape))
+        world = config.env_name, config.env.image_shape, config.env.action_cost
+        return self._once(("env", *world), lambda: envs.make(*world))
 
     def _programs(self, config: Config) -> str:
         """All on which the compiled programs of training depend."""
@@ -273,7 +278,9 @@ class Cells:
         whole = dataclasses.replace(config, data=dataclasses.replace(config.data, tasks=self.capacity))
         env = self._env(config)
         which = config.seed if split == "train" else config.evaluation.shots
-        return self._once(("demos", config.env_name, split, which), lambda: split_demos(env, whole, split))
+        return self._once(
+            ("demos", config.env_name, config.env.action_cost, split, which), lambda: split_demos(env, whole, split)
+        )
 
     def _once(self, key: Any, make: Callable[[], Any]) -> Any:
         if key not in self._made:

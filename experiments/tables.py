@@ -11,7 +11,6 @@ from milx import config as config_lib
 from milx.config import Config
 
 flags.adopt_module_key_flags(options)
-_ROWS = flags.DEFINE_list("rows", None, "Which rows; default all.")
 
 
 class Row(NamedTuple):
@@ -62,9 +61,7 @@ def make(table: Table) -> None:
     Raises:
         ValueError: for a row that the table does not have; the message lists those that it has.
     """
-    if unknown := sorted(set(_ROWS.value or ()) - set(table.rows)):
-        raise ValueError(f"rows: got {unknown[0]!r}, expected some of {', '.join(table.rows)}")
-    rows = {name: row for name, row in table.rows.items() if _ROWS.value is None or name in _ROWS.value}
+    rows = options.rows(table.rows)
     folder, runners = options.folder(table.folder), {}
     seeds = range(options.SEEDS.value)
     for seed in seeds:

@@ -15,7 +15,7 @@ from milx.simulation import split_demos
 def main(config: Config, workdir: str) -> None:
     """Writes train.npz, validation.npz and test.npz."""
     validate.check(config)
-    env = envs.make(config.env_name, config.env.image_shape)
+    env = envs.make(config.env_name, config.env.image_shape, config.env.action_cost)
     for split in envs.SPLITS:
         demos = split_demos(env, config, split)
         path = pathlib.Path(workdir) / f"{split}.npz"

@@ -15,6 +15,11 @@ from milx import validate
 GIVEN = ("video+state+action", "video+state", "video")
 """What a demonstration can show of a new task."""
 
+VARIANTS = ("maml", "anil", "boil", "cavia", "multi_step")
+"""Relatives of MAML (Finn et al. 2017): the inner step changes the last layer only (ANIL, Raghu et al. 2020), all but
+the last (BOIL, Oh et al. 2021) or the bias transformation only (CAVIA, Zintgraf et al. 2019); or the loss after every
+inner step counts (MAML++, Antoniou et al. 2019)."""
+
 
 @dataclasses.dataclass
 class EnvConfig:
@@ -22,9 +27,12 @@ class EnvConfig:
 
     Attributes:
         image_shape: (H, W) of the policy's image in pixels.
+        action_cost: weight of the actions in the planner's cost: with a lower one the expert moves at once and fast,
+            and its first actions tell where it goes; None for the environment's own.
     """
 
     image_shape: tuple[int, int] = (64, 80)
+    action_cost: float | None = None
 
 
 @dataclasses.dataclass
@@ -85,6 +93,8 @@ class NetworkConfig:
         fc_init_std: standard deviation of their first weights; None for LeCun's initialisation.
         bias_transformation: size of the learned vector beside the first fully connected layer's input; 0 for none.
         heads: 1, or 2 for a separate output layer in the inner loss.
+        inner_first_layer: a first fully connected layer of its own in the inner loss, as in the released code where
+            demonstrations are video alone.
         goal_head: predict where the episode ends, from the image, or from the state where the policy sees no pixels,
             and show the prediction to the layers after it (`milx.networks.goal`).
         hindsight_head: where a demonstration is video alone, learn to tell from its first and last image what the goal
@@ -107,6 +117,7 @@ class NetworkConfig:
     fc_init_std: float | None = None
     bias_transformation: int = 10
     heads: int = 1
+    inner_first_layer: bool = False
     goal_head: bool = False
     hindsight_head: bool = False
     learned_loss: str | None = None
@@ -124,6 +135,7 @@ class MILConfig:
         learn_inner_lr: meta-learn a factor on alpha for every tensor.
         inner_clip: bound on each entry of the inner gradient.
         first_order: do not differentiate through the inner gradient.
+        variant: one of VARIANTS: what the inner step changes, or which of its results the meta-objective sees.
         loss_scale: m; errors of the actions are multiplied by it before they are squared.
         whiten_actions: let the network predict actions with zero mean and unit variance.
         goal_weight: weight of the goal head's negative log likelihoods.
@@ -135,6 +147,7 @@ class MILConfig:
     learn_inner_lr: bool = False
     inner_clip: float = 20.0
     first_order: bool = False
+    variant: str = "maml"
     loss_scale: float = 1.0
     whiten_actions: bool = False
     goal_weight: float = 0.0
@@ -164,6 +177,7 @@ class TrainConfig:
 
     Attributes:
         steps: meta-updates.
+        imitation_steps: so many of them, the first, imitate all demonstrations without an inner step (MIL only).
         meta_batch: tasks in a meta-batch.
         shots: support demonstrations of each task.
         support_frames: time steps drawn from each support demonstration; None for all.
@@ -175,6 +189,7 @@ class TrainConfig:
     """
 
     steps: int = 30_000
+    imitation_steps: int = 0
     meta_batch: int = 5
     shots: int = 1
     support_frames: int | None = None

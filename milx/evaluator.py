@@ -3,6 +3,7 @@
 One adaptation per task, on a demonstration whose own scene is never a trial scene; then trials in fresh scenes.
 """
 
+import dataclasses
 import functools
 import math
 from typing import Any, NamedTuple
@@ -10,7 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from milx import parallel
+from milx import listening, parallel
 from milx.chunks import map_in_chunks, map_in_groups
 from milx.config import Config, DataConfig, EvalConfig
 from milx.data.demos import DemoSet, render_demo, shapes
@@ -20,8 +21,10 @@ from milx.methods.random import Random
 from milx.rollout import rollout
 from milx.trajopt.expert import judge, perform
 from milx.trajopt.ilqr import Options
-from milx.types import Params
+from milx.types import Demo, Params, TaskBatch
 
+_LISTENERS = 24
+"""Held-out tasks on which `listen` measures, at most."""
 _PIXELS = 64_000_000
 """Pixels of demonstrations that a device adapts to at once: an inner step keeps all activations for its gradient."""
 
@@ -59,11 +62,21 @@ class Trials(NamedTuple):
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
 def _run_batch(
-    env: Env, method: Method, params: Params, task: Task, states: State, action: jax.Array, scene: State, key: jax.Array
+    env: Env,
+    method: Method,
+    params: Params,
+    task: Task,
+    shown: Task,
+    states: State,
+    action: jax.Array,
+    scene: State,
+    key: jax.Array,
 ) -> Trials:
-    """Adapts to demonstrations [N, K, T, ...], then lets the policy act from scenes [N, trials]."""
+    """Adapts to demonstrations [N, K, T, ...] of tasks `shown`, then lets the policy act from scenes [N, trials]."""
 
-    def run_tasks(params: Params, task: Task, states: State, action: jax.Array, scene: State, key: jax.Array) -> Trials:
+    def run_tasks(
+        params: Params, task: Task, shown: Task, states: State, action: jax.Array, scene: State, key: jax.Array
+    ) -> Trials:
         def adapt(task: Task, states: State, action: jax.Array) -> Params:
             return method.adapt(params, jax.vmap(functools.partial(render_demo, env, task))(states, action))
 
@@ -71,10 +84,10 @@ def _run_batch(
             visited, _ = rollout(env, method, task_params, task, scene, key)
             return Trials(env.success(task, visited), env.other_criteria(task, visited), visited)
 
-        task_params = map_in_groups(adapt, (task, states, action), _tasks_at_once(env, action))
+        task_params = map_in_groups(adapt, (shown, states, action), _tasks_at_once(env, action))
         return jax.vmap(jax.vmap(trial, in_axes=(None, None, 0, 0)))(task_params, task, scene, key)
 
-    return parallel.split_tasks(run_tasks, shared=1)(params, task, states, action, scene, key)
+    return parallel.split_tasks(run_tasks, shared=1)(params, task, shown, states, action, scene, key)
 
 
 def _tasks_at_once(env: Env, action: jax.Array) -> int:
@@ -83,7 +96,15 @@ def _tasks_at_once(env: Env, action: jax.Array) -> int:
     return _PIXELS // (shots * length * math.prod(env.image_shape)) if env.vision else len(action)
 
 
-def run_trials(env: Env, method: Method, params: Params, demos: DemoSet, config: EvalConfig, key: jax.Array) -> Trials:
+def run_trials(
+    env: Env,
+    method: Method,
+    params: Params,
+    demos: DemoSet,
+    config: EvalConfig,
+    key: jax.Array,
+    misled: bool = False,
+) -> Trials:
     """Runs every trial of every task in `demos`.
 
     Args:
@@ -93,12 +114,14 @@ def run_trials(env: Env, method: Method, params: Params, demos: DemoSet, config:
         demos: held-out tasks; the policy adapts to the first `config.shots` demonstrations of each.
         config: trials, shots and batch.
         key: draws the trial scenes.
+        misled: show each task's policy the next task's demonstrations instead, and judge it by its own task.
     """
     scene_key, act_key = jax.random.split(key)
     scene = trial_scenes(env, demos.task, scene_key, config.trials)
-    support = jax.tree.map(lambda x: x[:, : config.shots], (demos.states, demos.action))
+    shown = jax.tree.map(lambda x: jnp.roll(x, -1, axis=0), demos) if misled else demos
+    support = jax.tree.map(lambda x: x[:, : config.shots], (shown.states, shown.action))
     keys = jax.random.split(act_key, (demos.num_tasks, config.trials))
-    inputs = (demos.task, *support, scene, keys)
+    inputs = (demos.task, shown.task, *support, scene, keys)
     return map_in_chunks(functools.partial(_run_batch, env, method, params), inputs, config.batch)
 
 
@@ -108,11 +131,38 @@ def precompile(env: Env, method: Method, params: Params, config: EvalConfig) -> 
     batch = shapes(env, size, config.shots)
     keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), (size, config.trials)))
     scene = jax.eval_shape(lambda task: trial_scenes(env, task, jax.random.key(0), config.trials), batch.task)
-    _run_batch.lower(env, method, params, batch.task, batch.states, batch.action, scene, keys).compile()
+    shown = batch.task, batch.states, batch.action
+    _run_batch.lower(env, method, params, batch.task, *shown, scene, keys).compile()
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1, 4))
+def _listen(env: Env, method: Method, params: Params, demos: DemoSet, shots: int) -> dict[str, jax.Array]:
+    def render(task: Task, states: State, action: jax.Array) -> Demo:
+        return jax.vmap(functools.partial(render_demo, env, task))(states, action)
+
+    shown = parallel.split_tasks(jax.vmap(render))(demos.task, demos.states, demos.action)
+    batch = TaskBatch(jax.tree.map(lambda x: x[:, :shots], shown), jax.tree.map(lambda x: x[:, shots:], shown))
+    return listening.measure(method, params, batch, _tasks_at_once(env, demos.action[:, :shots]))
+
+
+def listen(env: Env, method: Method, params: Params, demos: DemoSet, shots: int) -> dict[str, float]:
+    """What `listening.measure` finds on held-out tasks: adapted to `shots` demonstrations, asked for the next one's.
+
+    Nothing where there are fewer than two tasks, or fewer tasks than devices.
+    """
+    count = min(demos.num_tasks, _LISTENERS) // parallel.num_devices() * parallel.num_devices()
+    if count < 2:
+        return {}
+    chosen = jax.tree.map(lambda x: x[:count], demos)
+    states = jax.tree.map(lambda x: x[:, : shots + 1], chosen.states)
+    chosen = dataclasses.replace(chosen, states=states, action=chosen.action[:, : shots + 1])
+    return {name: float(value) for name, value in _listen(env, method, params, chosen, shots).items()}
 
 
 class Floors(NamedTuple):
     """Success rates of "random" actions, the "task_blind" expert, and the "expert".
+
+    `describe` adds the policy's own with another task's demonstration, "other_demo".
 
     Attributes:
         success: by name.
@@ -166,9 +216,24 @@ def film(camera: Env, task: Task, states: State) -> jax.Array:
     return jax.vmap(camera.film)(task, states)
 
 
-def describe(env: Env, config: Config, trials: Trials, floors: Floors) -> dict[str, Any]:
-    """What the result file of a run says of its evaluation: what was asked and what came out, by every criterion."""
-    other = {name: {**_rate(success), "baselines": floors.other[name]} for name, success in trials.other.items()}
+def describe(env: Env, config: Config, trials: Trials, misled: Trials, floors: Floors) -> dict[str, Any]:
+    """What the result file of a run says of its evaluation: what was asked and what came out, by every criterion.
+
+    Args:
+        env: the environment.
+        config: of the run.
+        trials: after adaptation to each task's own demonstrations.
+        misled: after adaptation to another task's, judged by the own task.
+        floors: what stands beside the results.
+    """
+
+    def beside(floors: dict[str, float], success: jax.Array) -> dict[str, float]:
+        return {**floors, "other_demo": float(success.mean())}
+
+    other = {
+        name: {**_rate(success), "baselines": beside(floors.other[name], misled.other[name])}
+        for name, success in trials.other.items()
+    }
     return {
         "num_tasks_train": config.data.tasks,
         "num_demos_train": config.data.tasks * config.data.demos_per_task,
@@ -177,7 +242,7 @@ def describe(env: Env, config: Config, trials: Trials, floors: Floors) -> dict[s
         "trials": int(trials.success.size),
         **_rate(trials.success),
         "criterion": env.criterion,
-        "baselines": floors.success,
+        "baselines": beside(floors.success, misled.success),
         **({"other_criteria": other} if other else {}),
     }
 

@@ -106,7 +106,7 @@ def load(run: str | pathlib.Path) -> Policy:
         except (ValueError, TypeError, AttributeError, RecursionError) as error:
             raise ValueError(f"{folder / SPEC_FILE}: expected the sizes of a policy: {error}") from error
     else:
-        spec = spec_of(envs.make(config.env_name, config.env.image_shape))
+        spec = spec_of(envs.make(config.env_name, config.env.image_shape, config.env.action_cost))
     method = methods.make(config, spec)
     checkpoints = Checkpoints(folder / "checkpoints", read_only=True)
     if checkpoints.best is None:

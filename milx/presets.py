@@ -21,9 +21,26 @@ from milx.config import (
 
 def _reach_paper() -> Config:
     return Config(
-        network=NetworkConfig(fc_norm=False, fc_init_std=0.01),
-        mil=MILConfig(loss_scale=100.0),
+        env=EnvConfig(action_cost=1.0),
+        network=NetworkConfig(fc_norm=False),
+        mil=_paper_mil(),
+        optimizer=_conditioned(),
+        train=TrainConfig(steps=24_000, imitation_steps=2000, meta_batch=25),
     )
+
+
+def _paper_mil() -> MILConfig:
+    return MILConfig(inner_lr=0.03, whiten_actions=True)
+
+
+def _conditioned(learning_rate: float = 1e-3) -> OptimizerConfig:
+    return OptimizerConfig(learning_rate=learning_rate, warmup=0.05, cosine=True, clip_norm=1.0)
+
+
+def _reach_state_paper() -> Config:
+    config = _without_pixels(_reach_paper())
+    config.train.steps = 20_000
+    return config
 
 
 def _fast_mil() -> MILConfig:
@@ -36,7 +53,7 @@ def _reach_fast() -> Config:
             strides=(2, 2, 1), soft_argmax=True, fc_layers=(200, 200), goal_head=True, mixed_precision=True
         ),
         mil=_fast_mil(),
-        optimizer=OptimizerConfig(warmup=0.05, cosine=True, clip_norm=1.0),
+        optimizer=_conditioned(),
         train=TrainConfig(steps=36_000, meta_batch=64, support_frames=3, query_frames=3, redraw=True),
     )
 
@@ -82,12 +99,13 @@ def _push_paper() -> Config:
             soft_argmax=True,
             fc_layers=(200, 200, 200),
             fc_norm=False,
-            fc_init_std=0.01,
             bias_transformation=20,
             heads=2,
+            mixed_precision=True,
         ),
-        mil=MILConfig(inner_lr=0.01, inner_clip=10.0, loss_scale=50.0),
-        train=TrainConfig(meta_batch=15),
+        mil=_paper_mil(),
+        optimizer=_conditioned(),
+        train=TrainConfig(steps=20_000, imitation_steps=2000, meta_batch=15),
         evaluation=EvalConfig(tasks=740, trials=6, baseline_trials=6, batch=185),
     )
 
@@ -105,7 +123,7 @@ def _push_fast() -> Config:
         bias_transformation=20,
     )
     config.mil = _fast_mil()
-    config.optimizer = OptimizerConfig(learning_rate=3e-3, warmup=0.05, cosine=True, clip_norm=1.0)
+    config.optimizer = _conditioned(3e-3)
     config.train = TrainConfig(meta_batch=32, support_frames=4, query_frames=8, redraw=True)
     return config
 
@@ -158,7 +176,7 @@ def _place_fast() -> Config:
             bias_transformation=20,
         ),
         mil=_fast_mil(),
-        optimizer=OptimizerConfig(learning_rate=3e-3, warmup=0.05, cosine=True, clip_norm=1.0),
+        optimizer=_conditioned(3e-3),
         train=TrainConfig(meta_batch=32, support_frames=3, query_frames=8, redraw=True),
         evaluation=EvalConfig(tasks=180, trials=8, baseline_trials=8, batch=90),
     )
@@ -207,7 +225,7 @@ PRESETS: dict[str, dict[str, Callable[[], Config]]] = {
     "reach": {"paper": _reach_paper, "fast": _reach_fast, "cpu": _reach_cpu},
     "push": {"paper": _push_paper, "fast": _push_fast, "cpu": _push_cpu},
     "place": {"paper": _place_paper, "fast": _place_fast, "cpu": _place_cpu},
-    "reach_state": {"fast": _reach_state_fast, "cpu": _reach_state_cpu},
+    "reach_state": {"paper": _reach_state_paper, "fast": _reach_state_fast, "cpu": _reach_state_cpu},
     "recorded": {"fast": _recorded_fast, "cpu": _recorded_cpu},
 }
 """Preset factories by environment and name."""

@@ -37,7 +37,7 @@ def load(run: str | pathlib.Path) -> Policy:
         expected = f"the folder of a run, or one of {', '.join(names())}, which ship with milx"
         raise ValueError(f"run: got {str(run)!r}, expected {expected}")
     config = config_lib.from_dict(result(str(run))["config"])
-    spec = spec_of(envs.make(config.env_name, config.env.image_shape))
+    spec = spec_of(envs.make(config.env_name, config.env.image_shape, config.env.action_cost))
     method = methods.make(config, spec)
     params = pytrees.load(FOLDER / run / "params.npz", like=params_like(method, spec))
     return Policy(method, spec, params, config)

@@ -150,9 +150,11 @@ class RecordedRun(Run):
     def _shapes(self) -> Recorded:
         return self.shards.shapes
 
-    def _validate(self, params: Params) -> float:
+    def _validate(self, params: Params) -> tuple[float, dict[str, float]]:
         errors = self._errors(params, "validation")
-        return 1 - errors["after"] / errors["mean_action"]
+        names = {"own_demo": "after", "other_demo": "other_task", "no_demo": "before"}
+        heard = {name: errors[key] / errors["mean_action"] for name, key in names.items() if key in errors}
+        return 1 - heard["own_demo"], heard
 
     def _judge(self, params: Params) -> tuple[dict[str, Any], Callable[[dict[str, Any]], None]]:
         with self._clock("evaluate"):

@@ -9,6 +9,8 @@ import imageio.v3 as iio
 import numpy as np
 from matplotlib.figure import Figure
 
+from milx import listening
+
 
 def read_metrics(path: pathlib.Path) -> list[dict[str, Any]]:
     """The lines of a metrics.jsonl file that are whole: a kill or a full disk may have left half a line."""
@@ -20,35 +22,50 @@ def read_metrics(path: pathlib.Path) -> list[dict[str, Any]]:
 
 
 def learning_curve(metrics: list[dict[str, Any]], evaluation: dict[str, Any], path: pathlib.Path) -> None:
-    """Plots the parts of the meta-objective and the validation success, with floors, ceiling and test result.
+    """Plots whether the policy listens, how far the inner step moves it, and its success with floors and ceiling.
 
     Args:
-        metrics: lines with "step" and "action_loss", perhaps "goal_loss", or "validation_success".
+        metrics: lines with "step" and what `listening.measure` found, perhaps "goal_loss", or "validation_success".
         evaluation: the run's evaluation.json.
         path: image file to write.
     """
-    figure = Figure(figsize=(10, 3.6), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    left.set(xlabel="meta-updates", yscale="log", title="after adaptation")
-    parts = [("action_loss", "squared error of the actions", left, "tab:blue")]
+    figure = Figure(figsize=(14, 3.6), layout="constrained")
+    left, middle, right = figure.subplots(1, 3)
+    left.set(xlabel="meta-updates", ylabel="squared error of the actions (1: a constant)", title="does it listen?")
+    for (name, words), color in zip(listening.ERRORS.items(), ("tab:blue", "tab:orange", "0.6"), strict=True):
+        left.plot(*_curve(metrics, name), color=color, lw=1, label=f"{words} demonstration")
+    left.set_ylim(0, min(left.get_ylim()[1], 2.0))
+    left.legend(fontsize=8, loc="upper right")
     if any("goal_loss" in line for line in metrics):
-        parts.append(("goal_loss", "goal: negative log likelihood", left.twinx(), "tab:red"))
-    for name, label, axis, color in parts:
-        values = [(line["step"], line[name]) for line in metrics if name in line]
-        axis.plot(*zip(*values, strict=True), color=color, lw=1)
-        axis.set_ylabel(label, color=color)
-    valid = [(line["step"], line["validation_success"]) for line in metrics if "validation_success" in line]
-    right.plot(*zip(*valid, strict=True), "o-", color="tab:blue", label="validation")
+        axis = left.twinx()
+        axis.plot(*_curve(metrics, "goal_loss"), color="tab:red", lw=1)
+        axis.set_ylabel("goal: negative log likelihood", color="tab:red")
+    middle.set(xlabel="meta-updates", yscale="log", title="the inner step, by tensor (change / size)")
+    for name in sorted({name for line in metrics for name in line if name.startswith("step/")}):
+        steps, sizes = _curve(metrics, name)
+        moved = [(step, size) for step, size in zip(steps, sizes, strict=True) if size > 0]
+        if moved and not name.endswith(("bias", "centre")):
+            middle.plot(*zip(*moved, strict=True), lw=1, label=name.removeprefix("step/"))
+    if middle.lines:
+        middle.legend(fontsize=5)
+    steps, valid = _curve(metrics, "validation_success")
+    right.plot(steps, valid, "o-", color="tab:blue", label="validation")
     low, high = evaluation["wilson95"]
     success = evaluation["success"]
-    last = valid[-1][0]
     error = [[success - low], [high - success]]
-    right.errorbar([last], [success], error, fmt="s", color="black", label="test, 95%")
-    for (name, value), color in zip(evaluation["baselines"].items(), ("0.6", "tab:orange", "tab:green"), strict=False):
+    right.errorbar([steps[-1]], [success], error, fmt="s", color="black", label="test, 95%")
+    colors = ("0.6", "tab:orange", "tab:green", "tab:purple")
+    for (name, value), color in zip(evaluation["baselines"].items(), colors, strict=True):
         right.axhline(value, color=color, ls="--", lw=1, label=name.replace("_", "-"))
     right.set(xlabel="meta-updates", ylabel="success", ylim=(0, 1.02))
     right.legend(fontsize=8)
     figure.savefig(path, dpi=120)
+
+
+def _curve(metrics: list[dict[str, Any]], name: str) -> tuple[list[int], list[float]]:
+    """The steps whose line has this number, and the numbers."""
+    lines = [line for line in metrics if name in line]
+    return [line["step"] for line in lines], [line[name] for line in lines]
 
 
 def action_errors(metrics: list[dict[str, Any]], evaluation: dict[str, Any], path: pathlib.Path) -> None:

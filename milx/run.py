@@ -25,7 +25,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from milx import config as config_lib
-from milx import guard, methods, parallel, platform, results
+from milx import guard, listening, methods, parallel, platform, results
 from milx.checkpoint import UNVALIDATED, Checkpoints
 from milx.config import Config
 from milx.methods import Spec
@@ -99,8 +99,8 @@ class Run(abc.ABC):
         """Shapes and types of the data of `Training.at`."""
 
     @abc.abstractmethod
-    def _validate(self, params: Params) -> float:
-        """How well the parameters do on validation tasks."""
+    def _validate(self, params: Params) -> tuple[float, dict[str, float]]:
+        """How well the parameters do on validation tasks, and what `listening.measure` finds there."""
 
     @abc.abstractmethod
     def _judge(self, params: Params) -> tuple[dict[str, Any], Callable[[dict[str, Any]], None]]:
@@ -155,9 +155,14 @@ class Run(abc.ABC):
         def validate(state: TrainState) -> bool:
             """Gives a checkpoint its score; a signal meanwhile loses nothing but that."""
             with self._clock("evaluate"):
-                score = self._validate(state.params)
-            metrics.write(int(state.step), {f"validation_{self.metric}": score})
-            self.console.print(f"step {int(state.step)}: validation {self.metric} {score:.1%}")
+                score, heard = self._validate(state.params)
+            values = {self.metric: score, **heard}
+            metrics.write(int(state.step), {f"validation_{name}": value for name, value in values.items()})
+            self.console.print(
+                f"step {int(state.step)}: validation {self.metric} {score:.1%}{listening.describe(heard)}"
+            )
+            if 5 * int(state.step) >= config.steps and listening.is_deaf(heard):
+                self._warn(listening.ADVICE)
             with stop.deferred():
                 return save(state, score, checkpoints.replace)
 

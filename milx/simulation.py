@@ -12,12 +12,14 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from milx import envs, evaluator, platform, pytrees, report, validate, whitening
-from milx.config import Config
+from milx import envs, evaluator, platform, pytrees, report, whitening
+from milx import validate as validate_lib
+from milx.config import Config, EvalConfig
 from milx.data import demos as demos_lib
 from milx.data.demos import DemoSet
 from milx.envs.base import State
 from milx.evaluator import Trials
+from milx.methods import Method
 from milx.methods.random import Random
 from milx.policy import spec_of
 from milx.run import Run
@@ -32,7 +34,7 @@ def split_demos(env: envs.Env, config: Config, split: str) -> DemoSet:
     """The demonstrations of a split as a run uses them, planned or from the cache of earlier runs."""
     num_tasks, num_demos = {
         "train": (config.data.tasks, config.data.demos_per_task),
-        "validation": (config.evaluation.validation_tasks, config.evaluation.shots + config.data.spare_demos),
+        "validation": (config.evaluation.validation_tasks, config.evaluation.shots + max(config.data.spare_demos, 1)),
         "test": (config.evaluation.tasks, config.evaluation.shots + config.data.spare_demos),
     }[split]
     seed = config.seed if split == "train" else EVALUATION_SEED
@@ -63,6 +65,25 @@ def training_on(env: envs.Env, config: Config, train: DemoSet) -> Training:
     return Training(pytrees.fingerprint(train), statistics, lambda _: train, first_images)
 
 
+def validate(
+    env: envs.Env, method: Method, params: Params, demos: DemoSet, config: EvalConfig
+) -> tuple[float, dict[str, float]]:
+    """Success in the trials of the validation tasks, and what `listening.measure` finds there."""
+    trials = evaluator.run_trials(env, method, params, demos, config, trial_key("validation"))
+    return float(trials.success.mean()), evaluator.listen(env, method, params, demos, config.shots)
+
+
+def judge(
+    env: envs.Env, method: Method, params: Params, demos: DemoSet, config: Config, floors: evaluator.Floors
+) -> tuple[Trials, dict[str, Any]]:
+    """The trials of the test tasks, and what the result file says of them."""
+    trials, misled = (
+        evaluator.run_trials(env, method, params, demos, config.evaluation, trial_key("test"), misled)
+        for misled in (False, True)
+    )
+    return trials, evaluator.describe(env, config, trials, misled, floors)
+
+
 @functools.partial(jax.jit, static_argnums=0)
 def _robot_states(env: envs.Env, states: State) -> jax.Array:
     return jax.vmap(jax.vmap(jax.vmap(env.robot_state)))(states)
@@ -83,11 +104,11 @@ class SimulatedRun(Run):
     metric = "success"
 
     def __init__(self, config: Config, workdir: str | pathlib.Path, console: Console | None = None):
-        validate.check(config)
+        validate_lib.check(config)
         if config.data.demos_per_task <= config.train.shots:
             expected = f"more than train.shots = {config.train.shots}: another one is the query"
             raise ValueError(f"data.demos_per_task: got {config.data.demos_per_task}, expected {expected}")
-        self.env = envs.make(config.env_name, config.env.image_shape)
+        self.env = envs.make(config.env_name, config.env.image_shape, config.env.action_cost)
         self._demonstrations: dict[str, dict[str, float]] = {}
         sample = demos_lib.sampler(self.env, config.train)
         super().__init__(config, spec_of(self.env), sample, self.env.chain, workdir, console)
@@ -129,23 +150,20 @@ class SimulatedRun(Run):
             lambda: evaluator.precompile(env, random, (), config),
         ]
 
-    def _validate(self, params: Params) -> float:
-        key = trial_key("validation")
-        trials = evaluator.run_trials(self.env, self.method, params, self._validation, self.config.evaluation, key)
-        return float(trials.success.mean())
+    def _validate(self, params: Params) -> tuple[float, dict[str, float]]:
+        return validate(self.env, self.method, params, self._validation, self.config.evaluation)
 
     def _judge(self, params: Params) -> tuple[dict[str, Any], Callable[[dict[str, Any]], None]]:
-        config, test, key = self.config.evaluation, self.demos("test"), trial_key("test")
+        config, test = self.config, self.demos("test")
         with self._clock("evaluate"):
-            trials = evaluator.run_trials(self.env, self.method, params, test, config, key)
-            floors = evaluator.baselines(self.env, test, config, self.config.data, key)
+            floors = evaluator.baselines(self.env, test, config.evaluation, config.data, trial_key("test"))
+            trials, found = judge(self.env, self.method, params, test, config, floors)
 
         def draw(result: dict[str, Any]) -> None:
             metrics = report.read_metrics(self.folder / "metrics.jsonl")
             report.learning_curve(metrics, result, self.folder / "learning_curve.png")
             self._film(test, trials)
 
-        found = evaluator.describe(self.env, self.config, trials, floors)
         return found | {"demonstrations": self._demonstrations}, draw
 
     def _film(self, test: DemoSet, trials: Trials, num_tasks: int = 3) -> None:

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from milx import parallel
+from milx import listening, parallel
 from milx.chunks import map_in_groups
 from milx.config import OptimizerConfig, TrainConfig
 from milx.methods.base import Method
@@ -52,19 +52,23 @@ def make_optimizer(config: OptimizerConfig, steps: int) -> optax.GradientTransfo
     return optax.chain(clip, optax.adam(rate))
 
 
-def meta_gradient(method: Method, params: Params, batch: TaskBatch) -> tuple[Params, dict[str, jax.Array]]:
-    """The gradient of `method.loss`, and its metrics, [N] of each task.
+Loss = Callable[[Params, TaskBatch], tuple[jax.Array, dict[str, jax.Array]]]
+"""As `Method.loss`: the mean over a batch of N tasks, and metrics [N]."""
+
+
+def meta_gradient(loss: Loss, params: Params, batch: TaskBatch) -> tuple[Params, dict[str, jax.Array]]:
+    """The gradient of a loss, and its metrics, [N] of each task.
 
     A CPU works on a few tasks at a time, so that what they need stays in its cache.
 
     Args:
-        method: what learns.
-        params: its parameters.
+        loss: of a batch of tasks, say `method.loss`.
+        params: what it is differentiated by.
         batch: N tasks; all leaves have this leading axis.
     """
 
     def gradient(batch: TaskBatch) -> tuple[Params, dict[str, jax.Array]]:
-        return jax.grad(method.loss, has_aux=True)(params, batch)
+        return jax.grad(loss, has_aux=True)(params, batch)
 
     images = [demo.image for demo in (batch.support, batch.query) if demo.image is not None]
     if jax.default_backend() != "cpu" or not images:
@@ -107,15 +111,17 @@ class Trainer:
             were and the other metrics are 0, and "bad_task" the number of a task whose loss is not finite, else -1.
         """
 
-        def gradient(params: Params, data: Any, keys: jax.Array) -> tuple[Params, dict[str, jax.Array]]:
+        def gradient(
+            params: Params, data: Any, step: jax.Array, keys: jax.Array
+        ) -> tuple[Params, dict[str, jax.Array]]:
             batch = self.sample(data, keys)
-            grad, metrics = meta_gradient(self.method, params, batch)
+            grad, metrics = self._gradient(params, batch, step)
             task = jnp.zeros_like(metrics["loss"]) if batch.task is None else batch.task.astype(metrics["loss"].dtype)
             bad = parallel.largest(jnp.where(jnp.isfinite(metrics["loss"]), -1, task).max())
             return grad, {**jax.tree.map(jnp.mean, metrics), "bad_task": bad}
 
-        keys = jax.random.split(jax.random.fold_in(key, state.step), self.train.meta_batch)
-        grad, metrics = parallel.split_tasks(gradient, shared=2, average=True)(state.params, data, keys)
+        split = parallel.split_tasks(gradient, shared=3, average=True)
+        grad, metrics = split(state.params, data, state.step, self._keys(key, state.step))
         metrics["grad_norm"] = optax.tree.norm(grad)
         good = jnp.isfinite(metrics["grad_norm"]) & jnp.isfinite(metrics["loss"])
         updates, optimizer = self.optimizer.update(grad, state.optimizer, state.params)
@@ -127,15 +133,38 @@ class Trainer:
         metrics |= {"skipped": 1 - good.astype(jnp.float32), "bad_task": bad_task}
         return TrainState(state.step + 1, params, optimizer), metrics
 
+    def _keys(self, key: jax.Array, step: jax.Array) -> jax.Array:
+        """[N] which draw the batch of a step."""
+        return jax.random.split(jax.random.fold_in(key, step), self.train.meta_batch)
+
+    def _gradient(self, params: Params, batch: TaskBatch, step: jax.Array) -> tuple[Params, dict[str, jax.Array]]:
+        """That of plain imitation for the first updates, if so configured, and of the meta-objective after them."""
+
+        def meta_objective(params: Params, batch: TaskBatch) -> tuple[jax.Array, dict[str, jax.Array]]:
+            return self.method.loss(params, batch, step / self.train.steps)
+
+        if not self.train.imitation_steps:
+            return meta_gradient(meta_objective, params, batch)
+        losses = self.method.imitation, meta_objective
+        branches = [functools.partial(meta_gradient, loss) for loss in losses]
+        return jax.lax.cond(step < self.train.imitation_steps, *branches, params, batch)
+
     @functools.partial(jax.jit, static_argnums=(0, 4))
     def run(self, state: TrainState, data: Any, key: jax.Array, steps: int) -> tuple[TrainState, dict[str, jax.Array]]:
         """Runs `steps` meta-updates in one scan.
 
         Returns:
             The state, and the metrics' means over the updates that were not skipped; "skipped" is how many were, and
-            "bad_task" the largest.
+            "bad_task" the largest. What `listening.measure` finds is of the last parameters and the batch that comes
+            next.
         """
         state, metrics = jax.lax.scan(lambda s, _: self.update(s, data, key), state, length=steps)
         skipped, bad_task = metrics.pop("skipped").sum(), metrics.pop("bad_task").max()
         means = {name: value.sum() / jnp.maximum(steps - skipped, 1) for name, value in metrics.items()}
-        return state, {**means, "skipped": skipped, "bad_task": bad_task}
+        batch = parallel.split_tasks(self.sample, shared=1)(data, self._keys(key, state.step))
+        return state, {
+            **means,
+            **listening.measure(self.method, state.params, batch),
+            "skipped": skipped,
+            "bad_task": bad_task,
+        }

@@ -12,6 +12,7 @@ _SIZES = (1, 1 << 14)
 _LIMITS: dict[str, tuple[float, float]] = {
     "seed": (0, 2**32 - 1),
     "env.image_shape": (1, 4096),
+    "env.action_cost": (0, math.inf),
     "data.noise": (0, math.inf),
     "data.spare_demos": (0, 1000),
     "data.plan_iterations": (0, 10_000),
@@ -32,6 +33,7 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "mil.inner_clip": (0, math.inf),
     "mil.loss_scale": (0, math.inf),
     "mil.goal_weight": (0, math.inf),
+    "train.imitation_steps": (0, _LARGE),
     "optimizer.learning_rate": (0, math.inf),
     "optimizer.warmup": (0, 1),
     "optimizer.clip_norm": (0, math.inf),

@@ -26,11 +26,10 @@ from absl import app, flags
 from milx import envs, methods, platform
 from milx.config import Config
 from milx.envs.base import Env
-from milx.methods.base import Method
 from milx.networks import layers
 from milx.policy import spec_of
 from milx.presets import make_config
-from milx.trainer import meta_gradient
+from milx.trainer import Loss, meta_gradient
 from milx.types import Params, TaskBatch
 
 _OUT = flags.DEFINE_string("out", str(common.RESULTS), "Folder of the JSON file.")
@@ -52,13 +51,13 @@ def compile_gradient(
     """The meta-gradient, compiled, and parameters for it."""
     method = methods.make(config, spec_of(env))
     params = method.init(jax.random.key(0), workload.unit_whitening(env))
-    jitted = jax.jit(functools.partial(gradient, method))
+    jitted = jax.jit(functools.partial(gradient, method.loss))
     return jitted.lower(params, batch).compile(platform.pixel_options()), params
 
 
-def vmapped_gradient(method: Method, params: Params, batch: TaskBatch) -> Params:
+def vmapped_gradient(loss: Loss, params: Params, batch: TaskBatch) -> Params:
     """All tasks at once, on a CPU too."""
-    return jax.grad(method.loss, has_aux=True)(params, batch)[0]
+    return jax.grad(loss, has_aux=True)(params, batch)[0]
 
 
 def lax_convolution(x: jax.Array, kernel: jax.Array, stride: int) -> jax.Array:

@@ -234,8 +234,9 @@ def cached(
     The hash covers the arguments, the kind of device, the versions of JAX and MuJoCo, and the sources of environments
     and experts. How many demonstrations are planned at once is left out: it changes no more than rounding.
     """
-    request = [env.name, seed, split, num_tasks, num_demos, config.noise, config.plan_iterations, jax.default_backend()]
-    digest = hashlib.sha256(json.dumps([*request, jax.__version__, mujoco.__version__]).encode())
+    request = [env.name, seed, split, num_tasks, num_demos, config.noise, config.plan_iterations, env.action_cost]
+    request += [jax.default_backend(), jax.__version__, mujoco.__version__]
+    digest = hashlib.sha256(json.dumps(request).encode())
     root = pathlib.Path(__file__).parents[1]
     for source in sorted(path for pattern in SOURCES for path in root.glob(pattern)):
         digest.update(source.read_bytes())

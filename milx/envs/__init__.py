@@ -10,16 +10,20 @@ ENVS: dict[str, type[Env]] = {env.name: env for env in (Reach, ReachState, Push,
 __all__ = ["ENVS", "SPLITS", "Env", "State", "Task", "make"]
 
 
-def make(name: str, image_shape: tuple[int, int] | None = None) -> Env:
+def make(name: str, image_shape: tuple[int, int] | None = None, action_cost: float | None = None) -> Env:
     """Builds an environment.
 
     Args:
         name: a key of ENVS.
         image_shape: (H, W) in pixels; the published experiment's if None.
+        action_cost: weight of the actions in the planner's cost; the environment's own if None.
 
     Raises:
         ValueError: for a name that does not exist; the message lists those that do.
     """
     if name not in ENVS:
         raise ValueError(f"env: got {name!r}, expected one of {', '.join(ENVS)}")
-    return ENVS[name](image_shape)
+    env = ENVS[name](image_shape)
+    if action_cost is not None:
+        env.action_cost = action_cost
+    return env

@@ -70,6 +70,7 @@ class Env(abc.ABC):
         object_indices: [O][2] entries of the state with each object's place, where the state tells them.
         tactics: ways in which the controller may go about a scene, in the order of preference; what the numbers mean is
             the controller's affair.
+        action_cost: weight of the action in the planner's running cost (no unit): the lower, the faster the expert.
     """
 
     name: str
@@ -83,6 +84,7 @@ class Env(abc.ABC):
     vision: bool = True
     object_indices: tuple[tuple[int, ...], ...] = ()
     tactics: tuple[float, ...] = (0.0,)
+    action_cost: float
 
     def __init__(self, model: mujoco.MjModel, image_shape: tuple[int, int] | None = None):
         self.mj_model = model

@@ -38,8 +38,8 @@ FALL_FRAMES = 10
 """Images of the fall in a film."""
 START_NOISE = 0.12
 """Joints start within so much of _START (rad)."""
-OFF_COST, TURN_COST, ACTION_COST = 5.0, 0.5, 0.25
-"""Weights of the residuals: 1/m, and of unit vectors and actions, which have no unit."""
+OFF_COST, TURN_COST = 5.0, 0.5
+"""Weights of the residuals: 1/m, and of unit vectors, which have no unit."""
 _START = (0.0, -1.167, 0.0, 1.926, 0.0, 0.811, 0.0)
 _DAMPING = 0.05
 _OUT_OF_THE_WAY = (0.0, 0.0, -10.0)
@@ -216,7 +216,7 @@ class Place(Env):
 
     def running_residual(self, task: PlaceTask, state: State, action: jax.Array, t: jax.Array) -> jax.Array:
         """[15] tip off its place over the target (m), hand off pointing down and facing forward, action, weighted."""
-        return jnp.concatenate([self.terminal_residual(task, state), ACTION_COST * action])
+        return jnp.concatenate([self.terminal_residual(task, state), self.action_cost * action])
 
     def terminal_residual(self, task: PlaceTask, state: State) -> jax.Array:
         """[9] the same without the action."""

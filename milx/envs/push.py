@@ -40,8 +40,8 @@ BEHIND = 1.25
 NUM_JOINTS = 7
 _START = (0.0, -0.895, 0.0, 2.397, 0.0, 0.069, 0.0)
 _OUT_OF_THE_WAY = (0.0, 0.0, -10.0)
-OBJECT_COST, TIP_COST, ACTION_COST, FINAL_COST = 1.0, 0.5, 0.1, 10.0
-"""Weights of the residuals: 1/m, but for the action, which has no unit."""
+OBJECT_COST, TIP_COST, FINAL_COST = 1.0, 0.5, 10.0
+"""Weights of the residuals (1/m)."""
 _OBJECTS = ("object_0", "object_1")
 _PRONGS = ("prong_left", "prong_middle", "prong_right")
 _CANDIDATES = 64
@@ -89,6 +89,7 @@ class Push(Env):
     goal_indices = (14, 15)
     height_index = 16
     tactics = (0.0, 0.02, -0.02)
+    action_cost = 0.1
 
     def __init__(self, image_shape: tuple[int, int] | None = None):
         super().__init__(_build(), image_shape)
@@ -238,7 +239,7 @@ class Push(Env):
         The terms of the released code's reward, but their squares instead of their norms.
         """
         place, tip = self.objects(state)[task.target, :2], self.hand(state.qpos)[:2]
-        return jnp.concatenate([OBJECT_COST * place, TIP_COST * (tip - place), ACTION_COST * action])
+        return jnp.concatenate([OBJECT_COST * place, TIP_COST * (tip - place), self.action_cost * action])
 
     def terminal_residual(self, task: PushTask, state: State) -> jax.Array:
         """[2] object off goal (m), weighted."""

@@ -22,7 +22,6 @@ LAST_STEPS = 10
 """The target must be touched in one of the last steps of the episode."""
 # Colour grids {offset, offset + 0.1, ...}^3 of the splits: disjoint, so that test and validation colours are held out.
 COLOR_OFFSETS = {"train": 0.0, "validation": 0.025, "test": 0.05}
-ACTION_COST = 4.0
 VELOCITY_COST = 0.02
 _CANDIDATES = 64
 
@@ -56,6 +55,7 @@ class Reach(Env):
     criterion = f"fingertip within {TOUCH} m of the target in one of the last {LAST_STEPS} of 50 steps"
     state_size = 8
     goal_indices = (4, 5)
+    action_cost = 4.0
 
     def __init__(self, image_shape: tuple[int, int] | None = None):
         super().__init__(mujoco.MjModel.from_xml_path(str(ASSETS / "reach.xml")), image_shape)
@@ -129,7 +129,7 @@ class Reach(Env):
 
     def running_residual(self, task: ReachTask, state: State, action: jax.Array, t: jax.Array) -> jax.Array:
         """[6] fingertip off target (m), joint velocities and motor commands, weighted."""
-        return jnp.concatenate([self.off_target(task, state), VELOCITY_COST * state.qvel, ACTION_COST * action])
+        return jnp.concatenate([self.off_target(task, state), VELOCITY_COST * state.qvel, self.action_cost * action])
 
     def terminal_residual(self, task: ReachTask, state: State) -> jax.Array:
         """[4] fingertip off target (m) and joint velocities, weighted."""

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
-from milx.config import GIVEN, Config
+from milx.config import GIVEN, VARIANTS, Config
 from milx.methods.base import Method
 from milx.methods.context import ContextPolicy
 from milx.methods.maml import MIL
@@ -107,10 +107,25 @@ def make(config: Config, spec: Spec) -> Method:
     if config.method_name not in METHODS:
         raise ValueError(f"method: got {config.method_name!r}, expected one of {', '.join(METHODS)}")
     _check_given(config, spec)
+    _check_variant(config)
     if config.network.fixed_filters is not None and spec.image_shape is None:
         expected = "None: this policy sees no pixels"
         raise ValueError(f"network.fixed_filters: got {config.network.fixed_filters!r}, expected {expected}")
     return METHODS[config.method_name](config, spec)
+
+
+def _check_variant(config: Config) -> None:
+    """Raises ValueError for a relative of MAML that does not exist, or has nothing to adapt or to count."""
+    variant, steps = config.mil.variant, config.mil.inner_steps
+    if variant not in VARIANTS:
+        raise ValueError(f"mil.variant: got {variant!r}, expected one of {', '.join(VARIANTS)}")
+    if variant == "cavia" and not config.network.bias_transformation:
+        raise ValueError("network.bias_transformation: got 0, expected at least 1: mil.variant='cavia' adapts it alone")
+    if variant == "multi_step" and steps < 2:
+        raise ValueError(f"mil.inner_steps: got {steps}, expected at least 2: mil.variant='multi_step' counts them all")
+    if config.train.imitation_steps and config.method_name != "mil":
+        got = f"got {config.train.imitation_steps} with method {config.method_name!r}"
+        raise ValueError(f"train.imitation_steps: {got}, expected 0: only MIL has an inner step to leave out")
 
 
 def _check_given(config: Config, spec: Spec) -> None:

@@ -19,8 +19,17 @@ class Method(abc.ABC):
         """Draws the parameters at the start of meta-training; they carry the whitening of states and actions."""
 
     @abc.abstractmethod
-    def loss(self, params: Params, batch: TaskBatch) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """The meta-objective of a batch of N tasks, a scalar; and values worth a curve, [N] each, "loss" among them."""
+    def loss(
+        self, params: Params, batch: TaskBatch, progress: jax.Array | float = 1.0
+    ) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """The meta-objective of a batch of N tasks, a scalar; and values worth a curve, [N] each, "loss" among them.
+
+        `progress` is the part of the run that is done, in [0, 1].
+        """
+
+    def imitation(self, params: Params, batch: TaskBatch) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """As `loss`, but without an inner step, to start from; for methods that have one (`TrainConfig`)."""
+        raise NotImplementedError
 
     @abc.abstractmethod
     def adapt(self, params: Params, demo: Demo) -> Params:

@@ -49,7 +49,9 @@ class ContextPolicy(Method):
         context = jax.vmap(encode)(demo.image, demo.state, demo.action)
         return {"actor": params["actor"], "whitening": params["whitening"], "context": context}
 
-    def loss(self, params: Params, batch: TaskBatch) -> tuple[jax.Array, dict[str, jax.Array]]:
+    def loss(
+        self, params: Params, batch: TaskBatch, progress: jax.Array | float = 1.0
+    ) -> tuple[jax.Array, dict[str, jax.Array]]:
         """Imitation of the queries, averaged over the tasks and the support demonstrations; and its parts, [N]."""
 
         def task_loss(support: Demo, query: Demo) -> tuple[jax.Array, dict[str, jax.Array]]:

@@ -22,7 +22,7 @@ from milx.config import MILConfig
 from milx.methods.base import Method
 from milx.methods.imitation import behavioural_cloning, calibrate_goal_head, flat, goal_loss, shown
 from milx.networks.goal import Goal
-from milx.networks.policy import PolicyNetwork, PolicyOutput
+from milx.networks.policy import BIAS_TRANSFORMATION, PolicyNetwork, PolicyOutput
 from milx.types import Demo, Memory, Observation, Params, TaskBatch
 from milx.whitening import Whitening
 
@@ -84,41 +84,90 @@ class MIL(Method):
 
     def adapt(self, params: Params, demo: Demo) -> Params:
         """Takes the inner gradient steps (eq. 1) on demonstrations [K, T, ...]: their gradients are averaged."""
+        return {"policy": self._steps(params, demo)[-1], "whitening": params["whitening"]}
+
+    def _steps(self, params: Params, demo: Demo) -> list[Params]:
+        """The network's parameters before the inner steps and after each of them."""
         theta, demo = params["policy"], shown(demo, self.config.given, params["whitening"])
         demo = self._with_goal_in_hindsight(params, demo)
         rates = jax.tree.map(lambda _: self.config.inner_lr, theta)
         if self.config.learn_inner_lr:
             rates = jax.tree.map(lambda s: self.config.inner_lr * jnp.exp(s), params["inner_log_lr"])
-        clip = self.config.inner_clip
+        adapts, clip, thetas = self._adapted(theta), self.config.inner_clip, [theta]
+
+        def step(p: jax.Array, g: jax.Array, rate: jax.Array | float, adapts: bool) -> jax.Array:
+            return p - rate * jnp.clip(g, -clip, clip) if adapts else p
+
         for _ in range(self.config.inner_steps):
             grad = gradient(self._inner_loss, theta, params["whitening"], demo)
             if self.config.first_order:
                 grad = jax.lax.stop_gradient(grad)
-            theta = jax.tree.map(lambda p, g, rate: p - rate * jnp.clip(g, -clip, clip), theta, grad, rates)
-        return {"policy": theta, "whitening": params["whitening"]}
+            theta = jax.tree.map(step, theta, grad, rates, adapts)
+            thetas.append(theta)
+        return thetas
+
+    def _adapted(self, theta: Params) -> Params:
+        """Which tensors the inner step changes, a bool for each."""
+
+        def adapts(path: tuple, _: jax.Array) -> bool:
+            names = {entry.key for entry in path}
+            is_last = not names.isdisjoint(self.network.output_layers)
+            return {"anil": is_last, "boil": not is_last, "cavia": BIAS_TRANSFORMATION in names}.get(
+                self.config.variant, True
+            )
+
+        return jax.tree_util.tree_map_with_path(adapts, theta)
 
     def unadapted(self, params: Params) -> Params:
         """The parameters from which every task is learnt."""
         return {"policy": params["policy"], "whitening": params["whitening"]}
 
-    def loss(self, params: Params, batch: TaskBatch) -> tuple[jax.Array, dict[str, jax.Array]]:
+    def loss(
+        self, params: Params, batch: TaskBatch, progress: jax.Array | float = 1.0
+    ) -> tuple[jax.Array, dict[str, jax.Array]]:
         """The meta-objective (eq. 3), averaged over the tasks; and its parts, [N] of each task.
 
-        A hindsight head learns from the queries beside it, unadapted, as the inner step uses it.
+        With the variant "multi_step" it is sum over i = 1..n of w_i L(theta_i, d'), theta_i being the parameters after
+        i of the n inner steps: w_i = (1 - progress) / n for i < n, and w_n is what they leave of 1 (Antoniou et al.
+        2019, Section 4). A hindsight head learns from the queries beside it, unadapted, as the inner step uses it.
         """
 
         def task_loss(support: Demo, query: Demo) -> tuple[jax.Array, dict[str, jax.Array]]:
-            adapted = self.adapt(params, support)
-            loss, metrics = self.imitation_loss(adapted["policy"], adapted["whitening"], query)
-            if self.network.hindsight is not None and query.goal is not None:
-                whitening = jax.lax.stop_gradient(params["whitening"])
-                told = self._in_hindsight(params["policy"], whitening, query)
-                metrics["hindsight_loss"] = goal_loss(told, query.goal[:, :1], whitening, self.goal_indices)
-                loss += self.config.goal_weight * metrics["hindsight_loss"]
+            *earlier, adapted = self._steps(params, support)
+            loss, metrics = self._query_loss(params, adapted, query)
+            if self.config.variant == "multi_step":
+                losses = [self._query_loss(params, theta, query)[0] for theta in earlier[1:]]
+                weight = (1 - progress) / self.config.inner_steps
+                loss = (1 - weight * len(losses)) * loss + weight * sum(losses)
             return loss, metrics
 
         loss, metrics = jax.vmap(task_loss)(batch.support, batch.query)
         return loss.mean(), {"loss": loss, **metrics}
+
+    def imitation(self, params: Params, batch: TaskBatch) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """L(theta, d) + L(theta, d'), without an inner step: d through the head of the inner loss, if it shows actions.
+
+        The policy learns what all tasks share, so that the first inner gradients point at what is special about one.
+        """
+
+        def task_loss(support: Demo, query: Demo) -> tuple[jax.Array, dict[str, jax.Array]]:
+            loss, metrics = self._query_loss(params, params["policy"], query)
+            if self.network.learned_loss is None:
+                loss += self._inner_loss(params["policy"], params["whitening"], support)
+            return loss, metrics
+
+        loss, metrics = jax.vmap(task_loss)(batch.support, batch.query)
+        return loss.mean(), {"loss": loss, **metrics}
+
+    def _query_loss(self, params: Params, theta: Params, query: Demo) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """What parameters theta of the network lose on a task's queries, and the parts of it."""
+        loss, metrics = self.imitation_loss(theta, params["whitening"], query)
+        if self.network.hindsight is not None and query.goal is not None:
+            whitening = jax.lax.stop_gradient(params["whitening"])
+            told = self._in_hindsight(params["policy"], whitening, query)
+            metrics["hindsight_loss"] = goal_loss(told, query.goal[:, :1], whitening, self.goal_indices)
+            loss += self.config.goal_weight * metrics["hindsight_loss"]
+        return loss, metrics
 
     def act(self, task_params: Params, observation: Observation, memory: Memory) -> tuple[jax.Array, Memory]:
         """The adapted network's action for one observation."""

@@ -24,7 +24,9 @@ class Random(Method):
         """Nothing to learn."""
         return ()
 
-    def loss(self, params: Params, batch: TaskBatch) -> tuple[jax.Array, dict[str, jax.Array]]:
+    def loss(
+        self, params: Params, batch: TaskBatch, progress: jax.Array | float = 1.0
+    ) -> tuple[jax.Array, dict[str, jax.Array]]:
         """Zero: nothing to learn."""
         return jnp.zeros(()), {"loss": jnp.zeros(len(batch.query.action))}
 

@@ -1,5 +1,6 @@
 """The policy network of the paper: convolutions, then fully connected layers that also see the robot's state."""
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -13,6 +14,9 @@ from milx.networks.layers import ConvBlock, Dense, FixedConv, SpatialSoftArgmax
 from milx.networks.learned_loss import LearnedLoss
 from milx.types import Params
 
+BIAS_TRANSFORMATION = "bias_transformation"
+"""The parameter that joins the input of the first fully connected layer."""
+
 
 class PolicyOutput(NamedTuple):
     """What the network says of a batch of observations.
@@ -22,7 +26,7 @@ class PolicyOutput(NamedTuple):
         inner_action: [B, A] of the head that the inner loss sees; the same head if there is only one.
         goal: where the episode will end; None without a goal head.
         feature_map: [B, H, W, C] what the convolutions make of the image; None where the policy sees no pixels.
-        features: [B, F] what the last layer sees.
+        features: [B, F] what the last layer sees in the inner loss.
     """
 
     action: jax.Array
@@ -41,12 +45,14 @@ class PolicyNetwork(NamedTuple):
         learned_loss: (params, features [K, T, F]) -> [K], the loss of demonstrations without actions; None without one.
         hindsight: (params, feature maps of videos [K, T, H, W, C]) -> Goal, where the robot went in each; None without
             such a head.
+        output_layers: names of the parameters of the last layer of each head.
     """
 
     init: Callable[[jax.Array], Params]
     apply: Callable[[Params, jax.Array | None, jax.Array], PolicyOutput]
     learned_loss: Callable[[Params, jax.Array], jax.Array] | None = None
     hindsight: Callable[[Params, jax.Array], Goal] | None = None
+    output_layers: tuple[str, ...] = ()
 
 
 class ConvStack(nn.Module):
@@ -100,11 +106,18 @@ class Controller(nn.Module):
             head, on = (StateGoalHead, state) if features is None else (GoalHead, features)
             goal = head(self.goal_size, name="goal_head")(on, query)
             parts.append(goal.mean)
-        x = jnp.concatenate(parts, axis=-1)
-        for size in config.fc_layers:
-            x = Dense(size, hidden=True, norm=config.fc_norm, init_std=config.fc_init_std)(x)
-        heads = [Dense(self.action_size, init_std=config.fc_init_std)(x) for _ in range(config.heads)]
-        return PolicyOutput(action=heads[-1], inner_action=heads[0], goal=goal, feature_map=features, features=x)
+        seen = jnp.concatenate(parts, axis=-1)
+        hidden = functools.partial(Dense, hidden=True, norm=config.fc_norm, init_std=config.fc_init_std)
+        layers = [hidden(size) for size in config.fc_layers]
+        heads = [Dense(self.action_size, init_std=config.fc_init_std) for _ in range(config.heads)]
+        x = inner = _through(layers, seen)
+        if config.inner_first_layer:
+            inner = _through([hidden(config.fc_layers[0], name="inner_first"), *layers[1:]], seen)
+        return PolicyOutput(heads[-1](x), heads[0](inner), goal, features, inner)
+
+
+def _through(layers: list[Dense], x: jax.Array) -> jax.Array:
+    return functools.reduce(lambda x, layer: layer(x), layers, x)
 
 
 class _Policy(nn.Module):
@@ -117,7 +130,7 @@ class _Policy(nn.Module):
         # A learned constant joins the input of the first layer: its gradient gives the layer's bias a step of its own
         # (the paper's bias transformation, Section 4.1).
         size = self.config.bias_transformation
-        z = self.param("bias_transformation", nn.initializers.zeros, (size,))
+        z = self.param(BIAS_TRANSFORMATION, nn.initializers.zeros, (size,))
         features = None if image is None else ConvStack(self.config, name="vision")(image, state.dtype)
         controller = Controller(self.config, self.action_size, self.goal_size, name="controller")
         return controller(features, state, jnp.broadcast_to(z, (len(state), size)))
@@ -171,4 +184,5 @@ def make_policy(
         apply,
         None if config.learned_loss is None else learned_loss,
         hindsight if config.hindsight_head else None,
+        tuple(f"Dense_{len(config.fc_layers) + i}" for i in range(config.heads)),
     )
