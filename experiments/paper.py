@@ -42,7 +42,6 @@ class Row(NamedTuple):
 
 
 RELEASED = {
-    "env.action_cost": None,
     "mil.whiten_actions": False,
     "mil.loss_scale": 100.0,
     "mil.inner_lr": 1e-3,
@@ -52,7 +51,9 @@ RELEASED = {
     "optimizer.clip_norm": None,
     "train.imitation_steps": 0,
 }
-"""What turns reach's `paper` back into the numbers of the released code, with milx's own expert."""
+"""What turns reach's `paper` back into the numbers of the released code."""
+RAW = {name: value for name, value in RELEASED.items() if name.startswith("mil.")}
+FAST_EXPERT = {"env.action_cost": 1.0}
 SHORT = {"train.steps": 5000, "train.eval_every": 1000}
 CORES = {
     "env.image_shape": (32, 40),
@@ -73,7 +74,6 @@ def without(changes: dict[str, Any], *groups: str) -> dict[str, Any]:
     return {name: value for name, value in changes.items() if not name.startswith(groups)}
 
 
-_WHITENED = ("env.", "mil.")
 TABLES = {
     "results": {
         "reach": Row("reach, vision", "reach", {}, "a curve"),
@@ -85,19 +85,27 @@ TABLES = {
     },
     "plateau": {
         "released": Row("the released numbers", "reach", RELEASED | SHORT),
-        "fast-expert": Row("+ an expert that moves at once", "reach", without(RELEASED, "env.") | SHORT),
-        "whitened": Row("+ whitened actions", "reach", without(RELEASED, *_WHITENED) | SHORT),
-        "lecun": Row("+ LeCun's start", "reach", without(RELEASED, *_WHITENED, "network.") | SHORT),
+        "whitened": Row("+ whitened actions", "reach", without(RELEASED, "mil.") | SHORT),
+        "lecun": Row("+ LeCun's start", "reach", without(RELEASED, "mil.", "network.") | SHORT),
         "schedule": Row("+ clip, warm-up, cosine", "reach", {"train.imitation_steps": 0} | SHORT),
         "imitation": Row("+ imitation first: `paper`", "reach", SHORT),
-        "slow-expert": Row("`paper`, milx's slower expert", "reach", {"env.action_cost": None} | SHORT),
-        "five-tasks": Row("`paper`, five tasks in a meta-batch", "reach", {"train.meta_batch": 5} | SHORT),
+        "raw": Row("`paper` without whitened actions", "reach", RAW | SHORT),
         "small-start": Row("`paper`, weights from N(0, 0.01)", "reach", {"network.fc_init_std": 0.01} | SHORT),
+        "five-tasks": Row("`paper`, five tasks in a meta-batch", "reach", {"train.meta_batch": 5} | SHORT),
         "three-frames": Row(
             "`paper`, 3 time steps of 64 tasks",
             "reach",
             {"train.support_frames": 3, "train.query_frames": 3, "train.meta_batch": 64} | SHORT,
         ),
+        "fast-expert": Row("`paper`, an expert that moves at once", "reach", FAST_EXPERT | SHORT),
+        "fast-schedule": Row("the same without imitation", "reach", FAST_EXPERT | {"train.imitation_steps": 0} | SHORT),
+        "fast-lecun": Row(
+            "the same without clip, warm-up, cosine",
+            "reach",
+            FAST_EXPERT | without(RELEASED, "mil.", "network.") | SHORT,
+        ),
+        "fast-whitened": Row("the same from N(0, 0.01)", "reach", FAST_EXPERT | without(RELEASED, "mil.") | SHORT),
+        "fast-released": Row("the released numbers, that expert", "reach", FAST_EXPERT | RELEASED | SHORT),
     },
     "cores": {
         "cores": Row("32x40 pixels", "reach", CORES),
@@ -108,7 +116,6 @@ TABLES = {
         ),
         "cores-rate": Row("2e-3", "reach", CORES | {"optimizer.learning_rate": 2e-3}),
         "cores-alpha": Row("0.1", "reach", CORES | {"mil.inner_lr": 0.1}),
-        "cores-slow": Row("slow expert", "reach", CORES | {"env.action_cost": None}),
     },
 }
 _TABLE = flags.DEFINE_enum("table", "results", list(TABLES), "Which table.")

@@ -21,11 +21,10 @@ from milx.config import (
 
 def _reach_paper() -> Config:
     return Config(
-        env=EnvConfig(action_cost=1.0),
         network=NetworkConfig(fc_norm=False),
         mil=_paper_mil(),
         optimizer=_conditioned(),
-        train=TrainConfig(steps=24_000, imitation_steps=2000, meta_batch=25),
+        train=TrainConfig(steps=20_000, imitation_steps=2000, meta_batch=25),
     )
 
 
