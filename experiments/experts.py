@@ -17,7 +17,8 @@ from absl import app, flags
 from milx import envs, provenance, results
 from milx.config import DataConfig, EvalConfig
 from milx.data.demos import collect
-from milx.evaluator import baselines, wilson_interval
+from milx.evaluator import baselines
+from milx.intervals import wilson_interval
 
 EXPERTS = {"controller": 0, "one-tactic": 0, "ilqr": 5}
 """By name, the most iterations of iLQR."""

@@ -110,6 +110,10 @@ def judged(run: dict[str, Any], criterion: str) -> dict[str, Any]:
 
 
 def interval(runs: list[dict[str, Any]]) -> str:
-    """The mean over runs, from where to where their 95% intervals reach, and how many there are."""
-    low, high = min(run["wilson95"][0] for run in runs), max(run["wilson95"][1] for run in runs)
+    """The mean over runs, from where to where their 95% intervals reach, and how many there are.
+
+    The intervals are over held-out things where the files have such ("bootstrap95"), else over trials.
+    """
+    ends = [run.get("bootstrap95", run["wilson95"]) for run in runs]
+    low, high = min(end[0] for end in ends), max(end[1] for end in ends)
     return f"{statistics.mean(run['success'] for run in runs):.1%} ({low:.1%} to {high:.1%}; {len(runs)})"

@@ -97,6 +97,8 @@ class NetworkConfig:
             demonstrations are video alone.
         goal_head: predict where the episode ends, from the image, or from the state where the policy sees no pixels,
             and show the prediction to the layers after it (`milx.networks.goal`).
+        target_head: predict where the episode ends with a linear layer from the first image's features, and show the
+            prediction to the layers after it, as the paper does (Section 6.3); its squared error joins all losses.
         hindsight_head: where a demonstration is video alone, learn to tell from its first and last image what the goal
             head is to see in the first, and let that be the goal in the inner step.
         learned_loss: MIL's inner loss where demonstrations show no actions (`mil.given`): "linear", or "temporal" with
@@ -119,6 +121,7 @@ class NetworkConfig:
     heads: int = 1
     inner_first_layer: bool = False
     goal_head: bool = False
+    target_head: bool = False
     hindsight_head: bool = False
     learned_loss: str | None = None
     context: int = 512
@@ -138,7 +141,7 @@ class MILConfig:
         variant: one of VARIANTS: what the inner step changes, or which of its results the meta-objective sees.
         loss_scale: m; errors of the actions are multiplied by it before they are squared.
         whiten_actions: let the network predict actions with zero mean and unit variance.
-        goal_weight: weight of the goal head's negative log likelihoods.
+        goal_weight: weight of the goal head's negative log likelihoods, or of the target head's squared error.
         given: what a policy is shown of a new task: one of GIVEN. Queries, in meta-training, show everything.
     """
 

@@ -10,12 +10,14 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from milx import listening, parallel
 from milx.chunks import map_in_chunks, map_in_groups
 from milx.config import Config, DataConfig, EvalConfig
 from milx.data.demos import DemoSet, render_demo, shapes
 from milx.envs.base import Env, State, Task
+from milx.intervals import bootstrap_interval, wilson_interval
 from milx.methods.base import Method
 from milx.methods.random import Random
 from milx.rollout import rollout
@@ -27,15 +29,6 @@ _LISTENERS = 24
 """Held-out tasks on which `listen` measures, at most."""
 _PIXELS = 64_000_000
 """Pixels of demonstrations that a device adapts to at once: an inner step keeps all activations for its gradient."""
-
-
-def wilson_interval(successes: int, trials: int, z: float = 1.959964) -> tuple[float, float]:
-    """Wilson's score interval of a success rate (Wilson 1927); 95% by default."""
-    rate, spread = successes / trials, z * z / trials
-    centre = (rate + spread / 2) / (1 + spread)
-    half = math.sqrt(rate * (1 - rate) * spread + spread * spread / 4) / (1 + spread)
-    # Rounding must not put the rate itself outside.
-    return max(min(centre - half, rate), 0.0), min(max(centre + half, rate), 1.0)
 
 
 @functools.partial(jax.jit, static_argnums=(0, 3))
@@ -216,37 +209,37 @@ def film(camera: Env, task: Task, states: State) -> jax.Array:
     return jax.vmap(camera.film)(task, states)
 
 
-def describe(env: Env, config: Config, trials: Trials, misled: Trials, floors: Floors) -> dict[str, Any]:
+def describe(env: Env, config: Config, task: Task, trials: Trials, misled: Trials, floors: Floors) -> dict[str, Any]:
     """What the result file of a run says of its evaluation: what was asked and what came out, by every criterion.
 
     Args:
         env: the environment.
         config: of the run.
+        task: [N] what was tried.
         trials: after adaptation to each task's own demonstrations.
         misled: after adaptation to another task's, judged by the own task.
         floors: what stands beside the results.
     """
+    kind = np.asarray(jax.vmap(env.target_kind)(task))
+    kind = np.where(kind < 0, np.arange(len(kind)), kind)
 
-    def beside(floors: dict[str, float], success: jax.Array) -> dict[str, float]:
-        return {**floors, "other_demo": float(success.mean())}
+    def judged(success: jax.Array, floors: dict[str, float], misled: jax.Array) -> dict[str, Any]:
+        successes, trials = int(success.sum()), int(success.size)
+        return {
+            "success": successes / trials,
+            "wilson95": list(wilson_interval(successes, trials)),
+            "bootstrap95": list(bootstrap_interval(np.asarray(success), kind)),
+            "baselines": {**floors, "other_demo": float(misled.mean())},
+        }
 
-    other = {
-        name: {**_rate(success), "baselines": beside(floors.other[name], misled.other[name])}
-        for name, success in trials.other.items()
-    }
+    other = {name: judged(success, floors.other[name], misled.other[name]) for name, success in trials.other.items()}
     return {
         "num_tasks_train": config.data.tasks,
         "num_demos_train": config.data.tasks * config.data.demos_per_task,
         "shots": config.evaluation.shots,
         "given": config.mil.given if env.vision else config.mil.given.removeprefix("video+"),
         "trials": int(trials.success.size),
-        **_rate(trials.success),
+        **judged(trials.success, floors.success, misled.success),
         "criterion": env.criterion,
-        "baselines": beside(floors.success, misled.success),
         **({"other_criteria": other} if other else {}),
     }
-
-
-def _rate(success: jax.Array) -> dict[str, Any]:
-    successes, trials = int(success.sum()), int(success.size)
-    return {"success": successes / trials, "wilson95": list(wilson_interval(successes, trials))}

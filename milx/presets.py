@@ -22,7 +22,7 @@ from milx.config import (
 def _reach_paper() -> Config:
     return Config(
         network=NetworkConfig(fc_norm=False),
-        mil=_paper_mil(),
+        mil=MILConfig(inner_lr=0.03, whiten_actions=True),
         optimizer=_conditioned(),
         train=TrainConfig(steps=20_000, imitation_steps=2000, meta_batch=25),
     )
@@ -37,10 +37,6 @@ def _reach_paper_cpu() -> Config:
     )
     config.evaluation = EvalConfig(validation_tasks=25, baseline_trials=1, batch=25)
     return config
-
-
-def _paper_mil() -> MILConfig:
-    return MILConfig(inner_lr=0.03, whiten_actions=True)
 
 
 def _conditioned(learning_rate: float = 1e-3) -> OptimizerConfig:
@@ -113,7 +109,7 @@ def _push_paper() -> Config:
             heads=2,
             mixed_precision=True,
         ),
-        mil=_paper_mil(),
+        mil=MILConfig(inner_lr=0.03, inner_clip=10.0, whiten_actions=True),
         optimizer=_conditioned(),
         train=TrainConfig(steps=20_000, imitation_steps=2000, meta_batch=15),
         evaluation=EvalConfig(tasks=740, trials=6, baseline_trials=6, batch=185),
@@ -162,12 +158,13 @@ def _place_paper() -> Config:
             soft_argmax=True,
             fc_layers=(100, 100, 100),
             fc_norm=False,
-            fc_init_std=0.01,
-            goal_head=True,
+            mixed_precision=True,
+            target_head=True,
             bias_transformation=20,
         ),
-        mil=MILConfig(inner_steps=5, inner_lr=0.005, inner_clip=30.0, loss_scale=50.0, goal_weight=1.0),
-        train=TrainConfig(steps=50_000, meta_batch=12),
+        mil=MILConfig(inner_steps=5, inner_lr=0.01, inner_clip=30.0, whiten_actions=True, goal_weight=1.0),
+        optimizer=_conditioned(),
+        train=TrainConfig(steps=20_000, imitation_steps=2000, meta_batch=12),
         evaluation=EvalConfig(tasks=180, trials=8, baseline_trials=8, batch=90),
     )
 

@@ -161,7 +161,8 @@ class Run(abc.ABC):
             self.console.print(
                 f"step {int(state.step)}: validation {self.metric} {score:.1%}{listening.describe(heard)}"
             )
-            if 5 * int(state.step) >= config.steps and listening.is_deaf(heard):
+            meta_updates = int(state.step) - config.imitation_steps
+            if 5 * meta_updates >= config.steps - config.imitation_steps and listening.is_deaf(heard):
                 self._warn(listening.ADVICE)
             with stop.deferred():
                 return save(state, score, checkpoints.replace)

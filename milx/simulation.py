@@ -81,7 +81,7 @@ def judge(
         evaluator.run_trials(env, method, params, demos, config.evaluation, trial_key("test"), misled)
         for misled in (False, True)
     )
-    return trials, evaluator.describe(env, config, trials, misled, floors)
+    return trials, evaluator.describe(env, config, demos.task, trials, misled, floors)
 
 
 @functools.partial(jax.jit, static_argnums=0)

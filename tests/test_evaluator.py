@@ -10,7 +10,7 @@ import pytest
 import scipy.stats
 from tiny import tiny_config
 
-from milx import evaluator, simulation
+from milx import evaluator, intervals, simulation
 from milx.chunks import map_in_chunks, map_in_groups
 from milx.config import EvalConfig
 from milx.methods import Method
@@ -26,14 +26,14 @@ KNOWN = {
 
 @pytest.mark.parametrize(("successes", "trials"), KNOWN)
 def test_wilson_interval_against_known_values(successes, trials):
-    np.testing.assert_allclose(evaluator.wilson_interval(successes, trials), KNOWN[successes, trials], atol=5e-5)
+    np.testing.assert_allclose(intervals.wilson_interval(successes, trials), KNOWN[successes, trials], atol=5e-5)
 
 
 @pytest.mark.parametrize("trials", [1, 4, 7, 10, 50, 150, 200, 600, 1500])
 def test_wilson_interval_against_scipy(trials):
     for successes in {0, 1, trials // 3, trials - 1, trials}:
         expected = scipy.stats.binomtest(successes, trials).proportion_ci(method="wilson")
-        low, high = evaluator.wilson_interval(successes, trials)
+        low, high = intervals.wilson_interval(successes, trials)
         np.testing.assert_allclose((low, high), (expected.low, expected.high), atol=1e-7)
         assert 0 <= low <= successes / trials <= high <= 1
 
@@ -41,13 +41,28 @@ def test_wilson_interval_against_scipy(trials):
 def test_a_result_counts_trials_by_every_criterion_and_has_floors_beside_each():
     table = jnp.array([[True, False, True], [False, False, True]])
     floors = evaluator.Floors({"random": 0.1}, {"nearly": {"random": 0.2}})
-    env = types.SimpleNamespace(vision=True, criterion="exactly")
+    env = types.SimpleNamespace(vision=True, criterion="exactly", target_kind=lambda task: task)
     trials = evaluator.Trials(table, {"nearly": ~table | table}, ())
-    found = evaluator.describe(env, tiny_config(), trials, floors)
-    assert (found["trials"], found["success"], found["baselines"]) == (6, 0.5, {"random": 0.1})
-    assert found["wilson95"] == list(evaluator.wilson_interval(3, 6))
-    other = {"success": 1.0, "wilson95": list(evaluator.wilson_interval(6, 6)), "baselines": {"random": 0.2}}
-    assert found["other_criteria"]["nearly"] == other
+    misled = evaluator.Trials(~table, {"nearly": table}, ())
+    found = evaluator.describe(env, tiny_config(), jnp.array([-1, -1]), trials, misled, floors)
+    assert (found["trials"], found["success"]) == (6, 0.5)
+    assert found["baselines"] == {"random": 0.1, "other_demo": 0.5}
+    assert found["wilson95"] == list(intervals.wilson_interval(3, 6))
+    np.testing.assert_allclose(found["bootstrap95"], [1 / 3, 2 / 3], rtol=1e-6)
+    other = found["other_criteria"]["nearly"]
+    assert (other["success"], other["bootstrap95"]) == (1.0, [1.0, 1.0])
+    assert other["wilson95"] == list(intervals.wilson_interval(6, 6))
+    assert other["baselines"] == {"random": 0.2, "other_demo": 0.5}
+
+
+def test_bootstrap_interval_is_over_things_and_not_over_trials():
+    """Where trials agree with those of the same thing, its percentiles are the binomial's of so many things."""
+    kind = np.random.default_rng(1).permutation(np.repeat(np.arange(16), 10))
+    success = np.repeat((kind < 8)[:, None], 6, axis=1)
+    expected = scipy.stats.binom(16, 0.5).ppf([0.025, 0.975]) / 16
+    np.testing.assert_allclose(intervals.bootstrap_interval(success, kind), expected, atol=1e-9)
+    low, high = intervals.wilson_interval(int(success.sum()), success.size)
+    assert high - low < 0.25 * (expected[1] - expected[0])
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -99,7 +114,9 @@ def test_no_trial_takes_place_in_the_demonstration_s_scene(trained, split, monke
     demos = getattr(trained, split)
     # What a trial is given: its scene, and the demonstration that the policy adapts to.
     monkeypatch.setattr(
-        evaluator, "_run_batch", lambda env, method, params, task, states, action, scene, key: (scene, states, action)
+        evaluator,
+        "_run_batch",
+        lambda env, method, params, task, shown, states, action, scene, key: (scene, states, action),
     )
     config = dataclasses.replace(trained.config.evaluation, trials=10)
     key = simulation.trial_key(split)

@@ -191,6 +191,10 @@ class Env(abc.ABC):
     def task_blind(self, key: jax.Array, task: Task) -> Task:
         """The task as someone understands it who saw no demonstration: a random candidate is the target."""
 
+    def target_kind(self, task: Task) -> jax.Array:
+        """A number for the kind of thing that the task's target is; -1 where every task has its own, the default."""
+        return jnp.asarray(-1)
+
     def control(self, task: Task, state: State, tactic: jax.Array) -> jax.Array:
         """[A] a controller that knows the task, with one of the `tactics`: it demonstrates where iLQR does not.
 

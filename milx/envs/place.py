@@ -209,6 +209,10 @@ class Place(Env):
         """[G] those of the thing and the containers; all else is plain."""
         return textures.on_geoms(task.texture, self._body, self.mj_model.geom_bodyid, data.xpos, data.xmat)
 
+    def target_kind(self, task: PlaceTask) -> jax.Array:
+        """The target's index into CONTAINERS."""
+        return task.container[task.target]
+
     def release_height(self, task: PlaceTask) -> jax.Array:
         """Height of the tip (m) at which the thing hangs CLEARANCE above the target's rim."""
         rim = task.container_size[task.target] * self._containers.height[task.container[task.target]]

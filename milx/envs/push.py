@@ -182,6 +182,10 @@ class Push(Env):
         """The geoms of the task's two objects, with a leading axis of 2."""
         return jax.tree.map(lambda x: x[task.shape], self._shapes)
 
+    def target_kind(self, task: PushTask) -> jax.Array:
+        """The target's shape, an index into SHAPES."""
+        return task.shape[task.target]
+
     def objects(self, state: State) -> jax.Array:
         """[2, 3] x, y (m) and turn (rad) of both objects."""
         return state.qpos[NUM_JOINTS:].reshape(2, 3)

@@ -1,6 +1,7 @@
 """What methods share that imitate: what they are shown, the loss, a goal head's start from the camera's calibration."""
 
 import dataclasses
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -37,7 +38,7 @@ def behavioural_cloning(
     whitening: Whitening,
     goal_indices: tuple[int, ...],
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """The mean squared error of the actions (eq. 2), plus the error of the goal head where there is one.
+    """The mean squared error of the actions (eq. 2), plus the error of the goal head or target head where there is one.
 
     Args:
         config: scale and weight of the losses.
@@ -52,24 +53,46 @@ def behavioural_cloning(
     """
     seen = flat(demo)
     error = config.loss_scale * (action - whitening.action(seen.action))
-    loss = action_loss = jnp.mean(jnp.square(error))
-    metrics = {"action_loss": action_loss}
-    if output.goal is not None and demo.goal is not None:
-        metrics["goal_loss"] = goal_loss(output.goal, demo.goal, whitening, goal_indices)
-        loss += config.goal_weight * metrics["goal_loss"]
-    return loss, metrics
+    action_loss = jnp.mean(jnp.square(error))
+    of_heads = head_losses(output, demo, whitening, goal_indices)
+    return action_loss + config.goal_weight * sum(of_heads.values()), {"action_loss": action_loss, **of_heads}
+
+
+def head_losses(
+    output: PolicyOutput, demo: Demo, whitening: Whitening, goal_indices: tuple[int, ...]
+) -> dict[str, jax.Array]:
+    """The errors of the goal head and of the target head, where there is one and `demo` tells the goal."""
+    losses = {}
+    if demo.goal is not None and output.goal is not None:
+        losses["goal_loss"] = goal_loss(output.goal, demo.goal, whitening, goal_indices)
+    if demo.goal is not None and output.target is not None:
+        losses["target_loss"] = target_loss(output.target, demo.goal, whitening, goal_indices)
+    return losses
 
 
 def goal_loss(predicted: Goal, goal: jax.Array, whitening: Whitening, goal_indices: tuple[int, ...]) -> jax.Array:
-    """The mean negative log likelihood of goals [K, T, G], predicted for all time steps one after the other.
+    """The mean negative log likelihood of goals [K, T, G], predicted for all time steps one after the other."""
+    return _mean_where_known(predicted.negative_log_likelihood, goal, whitening, goal_indices)
 
-    Where a goal is not known (NaN) there is no error.
-    """
+
+def target_loss(target: jax.Array, goal: jax.Array, whitening: Whitening, goal_indices: tuple[int, ...]) -> jax.Array:
+    """The mean squared error, entry by entry, of a target head's [K T, G] for goals [K, T, G], in whitened units."""
+
+    def error(white: jax.Array) -> jax.Array:
+        return jnp.square(target - white).mean(axis=-1)
+
+    return _mean_where_known(error, goal, whitening, goal_indices)
+
+
+def _mean_where_known(
+    error: Callable[[jax.Array], jax.Array], goal: jax.Array, whitening: Whitening, goal_indices: tuple[int, ...]
+) -> jax.Array:
+    """The mean of an error [K T] of whitened goals [K T, G]; where a goal is not known (NaN) there is none."""
     indices = jnp.array(goal_indices)
     white = ((goal - whitening.state_mean[indices]) / whitening.state_scale[indices]).reshape(-1, len(goal_indices))
     known = jnp.isfinite(white).all(axis=-1)
-    error = predicted.negative_log_likelihood(jnp.where(known[:, None], white, 0.0))
-    return jnp.where(known, error, 0.0).sum() / jnp.maximum(known.sum(), 1)
+    errors = error(jnp.where(known[:, None], white, 0.0))
+    return jnp.where(known, errors, 0.0).sum() / jnp.maximum(known.sum(), 1)
 
 
 def calibrate_goal_head(

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 
 from milx.config import MILConfig
 from milx.methods.base import Method
-from milx.methods.imitation import behavioural_cloning, calibrate_goal_head, flat, goal_loss, shown
+from milx.methods.imitation import behavioural_cloning, calibrate_goal_head, flat, goal_loss, head_losses, shown
 from milx.networks.goal import Goal
 from milx.networks.policy import BIAS_TRANSFORMATION, PolicyNetwork, PolicyOutput
 from milx.types import Demo, Memory, Observation, Params, TaskBatch
@@ -170,19 +170,23 @@ class MIL(Method):
         return loss, metrics
 
     def act(self, task_params: Params, observation: Observation, memory: Memory) -> tuple[jax.Array, Memory]:
-        """The adapted network's action for one observation."""
+        """The adapted network's action for one observation. The memory is what a target head saw in the first one."""
         whitening, batch = task_params["whitening"], jax.tree.map(lambda x: x[None], observation)
-        output = self.network.apply(task_params["policy"], batch.image, whitening.state(batch.state))
-        return whitening.unwhiten_action(output.action[0]), memory
+        remembered = None if isinstance(memory, tuple) else memory[None]
+        output = self.network.apply(task_params["policy"], batch.image, whitening.state(batch.state), 1, remembered)
+        action = whitening.unwhiten_action(output.action[0])
+        return action, memory if remembered is None or output.target is None else output.target[0]
+
+    def initial_memory(self, key: jax.Array) -> Memory:
+        """Nothing; for a target head the target [G], not known yet (NaN)."""
+        return jnp.full(len(self.goal_indices), jnp.nan) if self.network.has_target else ()
 
     def _inner_loss(self, theta: Params, whitening: Whitening, demo: Demo) -> jax.Array:
         if self.network.learned_loss is None:
             return self.imitation_loss(theta, whitening, demo, inner=True)[0]
         output = self._apply(theta, whitening, demo)
         loss = self.network.learned_loss(theta, output.features.reshape(*demo.state.shape[:2], -1)).mean()
-        if output.goal is not None and demo.goal is not None:
-            loss += self.config.goal_weight * goal_loss(output.goal, demo.goal, whitening, self.goal_indices)
-        return loss
+        return loss + self.config.goal_weight * sum(head_losses(output, demo, whitening, self.goal_indices).values())
 
     def _with_goal_in_hindsight(self, params: Params, demo: Demo) -> Demo:
         """Video alone gets a goal for its first image, as if given: the hindsight head's.
@@ -207,7 +211,7 @@ class MIL(Method):
     def _apply(self, theta: Params, whitening: Whitening, demo: Demo) -> PolicyOutput:
         """What the network says of all time steps of demonstrations [K, T, ...], one after the other."""
         seen = flat(demo)
-        return self.network.apply(theta, seen.image, whitening.state(seen.state))
+        return self.network.apply(theta, seen.image, whitening.state(seen.state), demo.state.shape[1])
 
     def imitation_loss(
         self, theta: Params, whitening: Whitening, demo: Demo, inner: bool = False

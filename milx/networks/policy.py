@@ -27,6 +27,7 @@ class PolicyOutput(NamedTuple):
         goal: where the episode will end; None without a goal head.
         feature_map: [B, H, W, C] what the convolutions make of the image; None where the policy sees no pixels.
         features: [B, F] what the last layer sees in the inner loss.
+        target: [B, G] whitened, as a target head has it; None without one.
     """
 
     action: jax.Array
@@ -34,6 +35,7 @@ class PolicyOutput(NamedTuple):
     goal: Goal | None
     feature_map: jax.Array | None
     features: jax.Array
+    target: jax.Array | None = None
 
 
 class PolicyNetwork(NamedTuple):
@@ -41,18 +43,22 @@ class PolicyNetwork(NamedTuple):
 
     Attributes:
         init: key -> params.
-        apply: (params, image [B, H, W, 3] uint8 or None, whitened state [B, S]) -> PolicyOutput.
+        apply: (params, image [B, H, W, 3] uint8 or None, whitened state [B, S]) -> PolicyOutput. For a target head it
+            takes two more: `length`, as many consecutive images as show one episode, whose first tells the target of
+            all; and `target` [B, G], where it is known already, NaN where it is not.
         learned_loss: (params, features [K, T, F]) -> [K], the loss of demonstrations without actions; None without one.
         hindsight: (params, feature maps of videos [K, T, H, W, C]) -> Goal, where the robot went in each; None without
             such a head.
         output_layers: names of the parameters of the last layer of each head.
+        has_target: whether there is a target head.
     """
 
     init: Callable[[jax.Array], Params]
-    apply: Callable[[Params, jax.Array | None, jax.Array], PolicyOutput]
+    apply: Callable[..., PolicyOutput]
     learned_loss: Callable[[Params, jax.Array], jax.Array] | None = None
     hindsight: Callable[[Params, jax.Array], Goal] | None = None
     output_layers: tuple[str, ...] = ()
+    has_target: bool = False
 
 
 class ConvStack(nn.Module):
@@ -87,7 +93,13 @@ class Controller(nn.Module):
 
     @nn.compact
     def __call__(
-        self, features: jax.Array | None, state: jax.Array, context: jax.Array, query: jax.Array | None = None
+        self,
+        features: jax.Array | None,
+        state: jax.Array,
+        context: jax.Array,
+        query: jax.Array | None = None,
+        length: int = 1,
+        target: jax.Array | None = None,
     ) -> PolicyOutput:
         """Acts.
 
@@ -96,12 +108,20 @@ class Controller(nn.Module):
             state: [B, S] whitened.
             context: [B, D], joins the input of the first fully connected layer.
             query: [B, C] or, without features, [B, candidates]: tells the goal head what to look for; None for nothing.
+            length: as many consecutive rows are one episode, see `PolicyNetwork.apply`.
+            target: [B, G] for a target head, see there; None if it is not known at all.
         """
-        config, goal = self.config, None
+        config, goal, seen_target = self.config, None, None
         parts, has_goal = [state, context], config.goal_head and self.goal_size
         if features is not None:
             seen = SpatialSoftArgmax()(features) if config.soft_argmax else features.reshape(len(features), -1)
             parts = [seen, *parts]
+            if config.target_head and self.goal_size:
+                first = jnp.repeat(seen[::length], length, axis=0)
+                seen_target = Dense(self.goal_size, name="target_head")(first)
+                if target is not None:
+                    seen_target = jnp.where(jnp.isnan(target), seen_target, target)
+                parts.append(seen_target)
         if has_goal:
             head, on = (StateGoalHead, state) if features is None else (GoalHead, features)
             goal = head(self.goal_size, name="goal_head")(on, query)
@@ -113,7 +133,7 @@ class Controller(nn.Module):
         x = inner = _through(layers, seen)
         if config.inner_first_layer:
             inner = _through([hidden(config.fc_layers[0], name="inner_first"), *layers[1:]], seen)
-        return PolicyOutput(heads[-1](x), heads[0](inner), goal, features, inner)
+        return PolicyOutput(heads[-1](x), heads[0](inner), goal, features, inner, seen_target)
 
 
 def _through(layers: list[Dense], x: jax.Array) -> jax.Array:
@@ -126,14 +146,16 @@ class _Policy(nn.Module):
     goal_size: int
 
     @nn.compact
-    def __call__(self, image: jax.Array | None, state: jax.Array) -> PolicyOutput:
+    def __call__(
+        self, image: jax.Array | None, state: jax.Array, length: int = 1, target: jax.Array | None = None
+    ) -> PolicyOutput:
         # A learned constant joins the input of the first layer: its gradient gives the layer's bias a step of its own
         # (the paper's bias transformation, Section 4.1).
         size = self.config.bias_transformation
         z = self.param(BIAS_TRANSFORMATION, nn.initializers.zeros, (size,))
         features = None if image is None else ConvStack(self.config, name="vision")(image, state.dtype)
         controller = Controller(self.config, self.action_size, self.goal_size, name="controller")
-        return controller(features, state, jnp.broadcast_to(z, (len(state), size)))
+        return controller(features, state, jnp.broadcast_to(z, (len(state), size)), None, length, target)
 
 
 def make_policy(
@@ -164,8 +186,14 @@ def make_policy(
             params = {**params, "hindsight": start["params"]}
         return params
 
-    def apply(params: Params, image: jax.Array | None, state: jax.Array) -> PolicyOutput:
-        output = module.apply({"params": params}, image, state)
+    def apply(
+        params: Params,
+        image: jax.Array | None,
+        state: jax.Array,
+        length: int = 1,
+        target: jax.Array | None = None,
+    ) -> PolicyOutput:
+        output = module.apply({"params": params}, image, state, length, target)
         assert isinstance(output, PolicyOutput)
         return output
 
@@ -185,4 +213,5 @@ def make_policy(
         None if config.learned_loss is None else learned_loss,
         hindsight if config.hindsight_head else None,
         tuple(f"Dense_{len(config.fc_layers) + i}" for i in range(config.heads)),
+        bool(config.target_head and goal_size and image_shape),
     )

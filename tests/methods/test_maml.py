@@ -101,6 +101,11 @@ VARIANTS = {
         {"learned_loss": "linear", "goal_head": True, "hindsight_head": True},
         {"given": "video", "goal_weight": 0.7, "inner_lr": 0.0},
     ),
+    "target head, two steps": ({"target_head": True, "soft_argmax": True}, {"inner_steps": 2, "goal_weight": 0.7}),
+    "learned loss of video, a first layer of its own": (
+        {"learned_loss": "linear", "heads": 2, "inner_first_layer": True},
+        {"given": "video"},
+    ),
     "learned loss over time, two steps": ({"learned_loss": "temporal"}, {"given": "video", "inner_steps": 2}),
 }
 
@@ -168,7 +173,7 @@ def test_no_gradient_reaches_the_whitening_and_adam_leaves_it(batch):
 
 CONSTANT = PolicyNetwork(
     init=lambda key: jnp.zeros(ACTION),
-    apply=lambda theta, image, state: PolicyOutput(
+    apply=lambda theta, image, state, *_: PolicyOutput(
         *[jnp.broadcast_to(theta, (len(state), ACTION))] * 2, goal=None, feature_map=None, features=state
     ),
 )
@@ -246,7 +251,7 @@ def test_a_video_teaches_the_goal_that_hindsight_sees_in_its_first_and_last_imag
     corner = lambda image: image[..., 0, 0, :2] / 255.0  # noqa: E731
     network = PolicyNetwork(
         init=CONSTANT.init,
-        apply=lambda theta, image, state: CONSTANT.apply(theta, image, state)._replace(
+        apply=lambda theta, image, state, *_: CONSTANT.apply(theta, image, state)._replace(
             goal=Goal(jnp.zeros((len(state), 1)), theta[None], jnp.zeros(())), feature_map=corner(image)[:, None, None]
         ),
         learned_loss=lambda theta, features: jnp.zeros(len(features)),
@@ -281,7 +286,7 @@ def test_a_video_teaches_the_goal_that_hindsight_sees_in_its_first_and_last_imag
 def test_goal_head_learns_the_goal_of_each_time_step(batch):
     network = PolicyNetwork(
         init=CONSTANT.init,
-        apply=lambda theta, image, state: CONSTANT.apply(theta, image, state)._replace(
+        apply=lambda theta, image, state, *_: CONSTANT.apply(theta, image, state)._replace(
             goal=Goal(jnp.zeros((len(state), 1)), jnp.array([[0.5, -2.0]]), jnp.asarray(0.3))
         ),
     )

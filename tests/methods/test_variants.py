@@ -40,7 +40,7 @@ def batch():
 PLAIN = Whitening(np.zeros(STATE), np.ones(STATE), np.zeros(ACTION), np.ones(ACTION))
 CONSTANT = PolicyNetwork(
     init=lambda key: jnp.asarray(THETA),
-    apply=lambda theta, image, state: PolicyOutput(
+    apply=lambda theta, image, state, *_: PolicyOutput(
         *[jnp.broadcast_to(theta, (len(state), ACTION))] * 2, goal=None, feature_map=None, features=state
     ),
 )
@@ -81,7 +81,9 @@ def test_the_inner_step_changes_what_the_variant_says_and_nothing_else(batch, va
         np.testing.assert_allclose(found[name], full[name], rtol=1e-12, err_msg=name)
 
 
-@pytest.mark.parametrize(("progress", "weights"), [(0.0, [1 / 3, 1 / 3, 1 / 3]), (0.7, [0.1, 0.1, 0.8]), (1.0, [0, 0, 1])])
+@pytest.mark.parametrize(
+    ("progress", "weights"), [(0.0, [1 / 3, 1 / 3, 1 / 3]), (0.7, [0.1, 0.1, 0.8]), (1.0, [0, 0, 1])]
+)
 def test_closed_form_of_the_multi_step_loss(batch, progress, weights):
     method, params = constant(variant="multi_step", inner_steps=3)
     mean = np.asarray(batch.support.action).mean(axis=(1, 2))

@@ -118,3 +118,23 @@ def test_the_prediction_of_the_goal_reaches_the_action(inputs):
     np.testing.assert_allclose(moved.goal.mean, plain.goal.mean + shift, rtol=1e-9)
     np.testing.assert_allclose(moved.action, folded.action, rtol=1e-9)
     assert np.abs(moved.action - plain.action).max() > 1e-3
+
+
+def test_the_inner_loss_may_have_a_first_layer_of_its_own(inputs):
+    network, params = build(inner_first_layer=True)
+    output, layers = network.apply(params, *inputs), params["controller"]
+    swapped = with_layers(params, inner_first=layers["Dense_0"], Dense_0=layers["inner_first"])
+    np.testing.assert_array_equal(network.apply(swapped, *inputs).action, output.inner_action)
+    np.testing.assert_array_equal(network.apply(swapped, *inputs).inner_action, output.action)
+    assert np.abs(output.action - output.inner_action).min() > 1e-6
+
+
+def test_the_first_image_of_an_episode_tells_the_target_of_all_its_steps(inputs):
+    network, params = build(target_head=True)
+    image, state = inputs
+    alone, episodes = network.apply(params, image, state), network.apply.__wrapped__(params, image, state, 3)
+    np.testing.assert_allclose(episodes.target, np.repeat(alone.target[::3], 3, axis=0), rtol=1e-9)
+    # A target that is known already takes the place of what the image tells, and reaches the action.
+    given = network.apply.__wrapped__(params, image, state, 1, episodes.target.at[::3].set(jnp.nan))
+    np.testing.assert_allclose(given.action, episodes.action, rtol=1e-9)
+    assert np.abs(alone.action - episodes.action)[np.arange(len(state)) % 3 > 0].min() > 1e-6

@@ -1,0 +1,123 @@
+"""Whether a policy listens: errors and steps against loops over the tasks."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from milx import listening
+from milx.config import MILConfig, TrainConfig
+from milx.methods import Method
+from milx.methods.maml import MIL
+from milx.networks.policy import PolicyNetwork, PolicyOutput
+from milx.trainer import Trainer, TrainState
+from milx.types import Demo, TaskBatch
+from milx.whitening import Whitening
+
+TASKS, STEPS, STATE, ACTION = 4, 6, 3, 2
+THETA = np.array([0.4, -1.3])
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Mean(Method):
+    """Does what the demonstration did on average, or if it is deaf always the same."""
+
+    deaf: bool = False
+
+    def init(self, key, whitening):
+        return ()
+
+    def loss(self, params, batch, progress=1.0):
+        raise NotImplementedError
+
+    def adapt(self, params, demo):
+        return params if self.deaf else demo.action.mean(axis=(0, 1))
+
+    def act(self, task_params, observation, memory):
+        return task_params + 0 * observation.state[0], memory
+
+
+@pytest.fixture(scope="module")
+def batch():
+    rng = np.random.default_rng(0)
+    place = rng.standard_normal((TASKS, 1, 1, ACTION))
+
+    def demos(count):
+        action = place + 0.3 * rng.standard_normal((TASKS, count, STEPS, ACTION))
+        return Demo(state=jnp.asarray(rng.standard_normal((TASKS, count, STEPS, STATE))), action=jnp.asarray(action))
+
+    return TaskBatch(demos(1), demos(2))
+
+
+def measure(method, params, batch, most=None):
+    found = jax.jit(lambda params, batch: listening.measure(method, params, batch, most))(params, batch)
+    return {name: float(value) for name, value in found.items()}
+
+
+@pytest.mark.parametrize("most", [None, 1])
+def test_errors_are_those_of_a_loop_over_the_tasks(batch, most):
+    shown, asked = np.asarray(batch.support.action), np.asarray(batch.query.action)
+    variance = asked.reshape(-1, ACTION).var(axis=0)
+
+    def error(demo_of):
+        each = [(shown[demo_of(i)].mean(axis=(0, 1)) - asked[i]) ** 2 / variance for i in range(TASKS)]
+        return np.mean(each)
+
+    found = measure(Mean(), jnp.zeros(ACTION), batch, most)
+    expected = {"own_demo": error(lambda i: i), "other_demo": error(lambda i: (i + 1) % TASKS)}
+    assert found == pytest.approx(expected, rel=1e-5)
+    assert not listening.is_deaf(found)
+    deaf = measure(Mean(deaf=True), jnp.zeros(ACTION), batch, most)
+    assert deaf["own_demo"] == deaf["other_demo"]
+    assert listening.is_deaf(deaf)
+
+
+PLAIN = Whitening(np.zeros(STATE), np.ones(STATE), np.zeros(ACTION), np.ones(ACTION))
+CONSTANT = PolicyNetwork(
+    init=lambda key: {"a": jnp.asarray(THETA)},
+    apply=lambda theta, image, state, *_: PolicyOutput(
+        *[jnp.broadcast_to(theta["a"], (len(state), ACTION))] * 2, goal=None, feature_map=None, features=state
+    ),
+)
+
+
+def test_the_size_of_the_step_is_relative_to_the_tensor(batch):
+    """An inner step moves a constant policy by 2 alpha / A of the way to the demonstration's mean action."""
+    alpha = 0.1
+    method = MIL(MILConfig(inner_lr=alpha, inner_clip=1e9), CONSTANT)
+    found = measure(method, {"policy": {"a": jnp.asarray(THETA)}, "whitening": PLAIN}, batch)
+    way = np.asarray(batch.support.action).mean(axis=(1, 2)) - THETA
+    size = lambda x: np.sqrt(np.mean(x**2, axis=-1))  # noqa: E731
+    assert found["step/a"] == pytest.approx(2 * alpha / ACTION * size(way).mean() / size(THETA), rel=1e-5)
+    asked = np.asarray(batch.query.action)
+    before = np.mean((THETA - asked) ** 2 / asked.reshape(-1, ACTION).var(axis=0))
+    assert found["no_demo"] == pytest.approx(before, rel=1e-5)
+    assert found["own_demo"] < found["no_demo"]
+
+
+def test_a_run_imitates_first_and_measures_the_batch_that_comes_next(batch):
+    method, rate = MIL(MILConfig(inner_lr=0.1, inner_clip=1e9), CONSTANT), 0.05
+    train = TrainConfig(steps=10, imitation_steps=2, meta_batch=TASKS)
+    rolled = lambda key: jax.random.randint(key, (), 0, 5)  # noqa: E731
+
+    def sample(data, keys):
+        return jax.tree.map(lambda x: x + rolled(keys[0]), data)
+
+    trainer, params = Trainer(sample, method, train, optax.sgd(rate)), {"policy": {"a": jnp.asarray(THETA)}}
+    params["whitening"] = jax.tree.map(jnp.asarray, PLAIN)
+    state, key = TrainState(jnp.zeros((), jnp.int32), params, optax.sgd(rate).init(params)), jax.random.key(1)
+    after, metrics = trainer.run(state, batch, key, 3)
+
+    theta = jnp.asarray(THETA)
+    for step in range(3):
+        drawn = sample(batch, trainer._keys(key, jnp.asarray(step)))
+        loss = method.imitation if step < 2 else method.loss
+        slope = jax.grad(lambda a, loss=loss, drawn=drawn: loss({**params, "policy": {"a": a}}, drawn)[0])(theta)
+        theta = theta - rate * slope
+    np.testing.assert_allclose(after.params["policy"]["a"], theta, rtol=1e-5)
+    following = sample(batch, trainer._keys(key, jnp.asarray(3)))
+    expected = measure(method, {**params, "policy": {"a": theta}}, following)
+    assert {name: float(metrics[name]) for name in expected} == pytest.approx(expected, rel=1e-4)
