@@ -97,6 +97,7 @@ class NetworkConfig:
             demonstrations are video alone.
         goal_head: predict where the episode ends, from the image, or from the state where the policy sees no pixels,
             and show the prediction to the layers after it (`milx.networks.goal`).
+        calibrate: start the goal head's votes from the camera's calibration, where it is known.
         target_head: predict where the episode ends with a linear layer from the first image's features, and show the
             prediction to the layers after it, as the paper does (Section 6.3); its squared error joins all losses.
         hindsight_head: where a demonstration is video alone, learn to tell from its first and last image what the goal
@@ -121,6 +122,7 @@ class NetworkConfig:
     heads: int = 1
     inner_first_layer: bool = False
     goal_head: bool = False
+    calibrate: bool = True
     target_head: bool = False
     hindsight_head: bool = False
     learned_loss: str | None = None

@@ -253,7 +253,9 @@ def make_config(env: str, method: str = "mil", preset: str = "fast", seed: int =
         raise ValueError(f"preset: got {preset!r}, expected one of {', '.join(PRESETS[env])}")
     config = PRESETS[env][preset]()
     config.env_name, config.method_name, config.preset, config.seed = env, method, preset, seed
-    config.train.support_frames = SUPPORT_FRAMES.get(method, config.train.support_frames)
+    if method != "mil":
+        config.train.support_frames = SUPPORT_FRAMES.get(method, config.train.support_frames)
+        config.train.imitation_steps, config.network.heads = 0, 1  # there is no inner step
     return config
 
 

@@ -86,7 +86,8 @@ def _with_context(config: Config, spec: Spec, encoder: Any, actor: Any = None) -
 
 
 def _calibration(config: Config, spec: Spec) -> tuple[tuple[float, ...], ...] | None:
-    return spec.image_to_goal if config.network.goal_head and spec.image_shape is not None else None
+    calibrated = config.network.goal_head and config.network.calibrate and spec.image_shape is not None
+    return spec.image_to_goal if calibrated else None
 
 
 METHODS: dict[str, Callable[[Config, Spec], Method]] = {
