@@ -17,7 +17,12 @@ import matplotlib.pyplot as plt
 import options
 from absl import app, flags
 
-LABELS = {"mil": "MIL", "contextual": "contextual", "lstm": "LSTM", "lstm_attention": "LSTM with attention"}
+LABELS = {
+    "mil": "MIL + goal head",
+    "contextual": "contextual + goal head",
+    "lstm": "LSTM + goal head",
+    "lstm_attention": "LSTM with attention",
+}
 TITLES = {
     "reach": "vision, held-out colours",
     "reach_state": "state, held-out scenes",

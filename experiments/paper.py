@@ -2,7 +2,7 @@
 
     python experiments/paper.py --table=results     # what is missing, then the table; --show runs nothing
     python experiments/paper.py --table=plateau --rows=released,whitened --seeds=1
-    python experiments/paper.py --table=plateau --show --figure=docs/plateau.png
+    python experiments/paper.py --table=plateau --show --curves=docs/plateau.png
 
 The other tables are `baselines`, `ladder` and `relatives` (`paper_rows.py` says what each of their rows changes).
 Stopped and started again it goes on with its last checkpoint.
@@ -21,7 +21,7 @@ from tables import interval
 flags.adopt_module_key_flags(options)
 _TABLE = flags.DEFINE_enum("table", "results", list(TABLES), "Which table.")
 _SEED = flags.DEFINE_integer("first_seed", 0, "The first of the seeds.")
-_FIGURE = flags.DEFINE_string("figure", None, "Where to draw the learning curves; default nowhere.")
+_CURVES = flags.DEFINE_string("curves", None, "Where to draw the learning curves; default nowhere.")
 
 
 def main(_: list[str]) -> None:
@@ -35,8 +35,8 @@ def main(_: list[str]) -> None:
             runners.setdefault(row.env, cells.Cells(folder, tasks)).run(named)
     found = cells.read(folder)
     print(markdown(rows, found))
-    if _FIGURE.value:
-        draw(rows, found, _FIGURE.value)
+    if _CURVES.value:
+        draw(rows, found, _CURVES.value)
 
 
 def _runs(name: str, shots: int, found: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:
@@ -55,6 +55,8 @@ def markdown(rows: dict[str, Row], found: dict[str, dict[str, Any]]) -> str:
         shown = " / ".join(interval(runs) for runs in columns)
         floors = [
             f"{statistics.mean(run['baselines'][floor] for run in columns[0]):.1%}"
+            if floor in columns[0][0]["baselines"]
+            else ""  # not measured yet when it ran
             for floor in ("other_demo", "random", "task_blind", "expert")
         ]
         seconds = f"{statistics.mean(run['wall_clock_s']['train'] for run in columns[0]):.0f} s"
@@ -65,15 +67,16 @@ def markdown(rows: dict[str, Row], found: dict[str, dict[str, Any]]) -> str:
 def draw(rows: dict[str, Row], found: dict[str, dict[str, Any]], path: str) -> None:
     """Draws validation success, and by how much another task's demonstration is worse, against the meta-updates."""
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4), layout="constrained")
-    colors = plt.get_cmap("tab20").colors
+    colors = [*plt.get_cmap("tab10").colors, *plt.get_cmap("Set2").colors]
     for number, (name, row) in enumerate(rows.items()):
-        for i, run in enumerate(_runs(name, row.shots[0], found)):
+        with_curve = [run for run in _runs(name, row.shots[0], found) if "curve" in run]
+        for i, run in enumerate(with_curve):
             style = {"color": colors[number % len(colors)], "lw": 1.2, "label": None if i else row.label}
             steps = [line["step"] for line in run["curve"]]
             left.plot(steps, [100 * line["validation_success"] for line in run["curve"]], **style)
             right.plot(steps, [line["other_demo"] / line["own_demo"] for line in run["curve"]], **style)
     left.set(xlabel="meta-updates", ylabel="success on validation tasks (%)", ylim=(0, 100))
-    right.set(xlabel="meta-updates", ylabel="error: another task's demonstration / its own", yscale="log")
+    right.set(xlabel="meta-updates", ylabel="error: another task's demonstration / its own")
     right.axhline(1.0, color="0.6", lw=0.8)
     left.legend(fontsize=7)
     figure.savefig(path, dpi=150)

@@ -173,7 +173,7 @@ _RELATIVES = {
 
 TABLES: dict[str, dict[str, Row]] = {
     "results": _RESULTS,
-    "plateau": {name: Row(label, "reach", changes | _SHORT) for name, (label, changes) in _PLATEAU.items()},
+    "plateau": {name: Row(label, "reach", _SHORT | changes) for name, (label, changes) in _PLATEAU.items()},
     "baselines": _BASELINES,
     "ladder": _ladder(),
     "relatives": _RELATIVES,

@@ -10,6 +10,12 @@ import statistics
 import sys
 
 
+def method(result: dict) -> str:
+    """What was trained, and whether with milx's goal head."""
+    name = {"mil": "MIL", "lstm": "LSTM"}.get(result["method"], result["method"])
+    return f"{name} + goal head" if result["config"]["network"]["goal_head"] else name
+
+
 def setting(result: dict) -> str:
     """The preset, and what was changed in it."""
     return f"{result['preset']} {result['variant']}".strip()
@@ -20,7 +26,7 @@ def row(result: dict) -> str:
     low, high = result["wilson95"]
     floors = result["baselines"]
     cells = [
-        result["method"],
+        method(result),
         setting(result),
         str(result["seed"]),
         f"{result['success']:.1%} ({low:.1%} to {high:.1%})",
@@ -37,9 +43,9 @@ def mean(group: list[dict]) -> str:
     successes = [result["success"] for result in group]
     floors = [statistics.mean(r["baselines"][name] for r in group) for name in ("random", "task_blind", "expert")]
     cells = [
-        group[0]["method"],
+        method(group[0]),
         setting(group[0]),
-        f"mean of {len(group)}",
+        f"mean of {len(group)}, range",
         f"**{statistics.mean(successes):.1%}** ({min(successes):.1%} to {max(successes):.1%})",
         str(sum(result["trials"] for result in group)),
         *(f"{floor:.1%}" for floor in floors),

@@ -31,6 +31,7 @@ def main(_: list[str]) -> None:
     changes = [(name, size) for name, sizes in _SIZES.items() for size in sizes[: 1 if _TINY.value else None]]
     for name, size in [("meta-batch", 5), *changes]:
         config = make_config("reach", preset="paper")
+        config.train.meta_batch, config.train.imitation_steps = 5, 0
         config.network.mixed_precision = common.ACCELERATED
         frames = size if name == "time steps" else config.train.support_frames
         config.train.support_frames = config.train.query_frames = frames

@@ -42,7 +42,9 @@ def domain(name: str) -> tuple[Config, Env]:
     """Configuration and environment of the paper's experiment."""
     if name == "push":
         return push_sized.config(), push_sized.PushSized()
-    return make_config("reach", preset="paper"), envs.make("reach")
+    config = make_config("reach", preset="paper")
+    config.train.meta_batch = 5
+    return config, envs.make("reach")
 
 
 def compile_gradient(

@@ -9,13 +9,15 @@ sys.path.insert(0, str(pathlib.Path(__file__).parents[2] / "experiments"))
 import ablations
 import cells
 import figure3
+import paper
+import paper_rows
 import table
 import table1
 import table2
 import table3
 import tables
 
-from milx import envs, methods
+from milx import envs, methods, training
 from milx.policy import spec_of
 
 
@@ -94,3 +96,28 @@ def flags():
     yield saved
     saved.unparse_flags()
     saved.rows = None
+
+
+PAPER = [(name, row) for rows in paper_rows.TABLES.values() for name, row in rows.items()]
+
+
+@pytest.mark.parametrize(("name", "row"), PAPER, ids=[name for name, _ in PAPER])
+def test_rows_of_the_published_method_fit_together_and_have_no_addition_unless_they_say_so(name, row):
+    config = paper_rows.configure(row, row.shots[0], seed=0)
+    methods.make(config, spec_of(envs.make(row.env, (48, 48))))
+    training.check_steps(config)
+    additions = config.network.goal_head, config.train.redraw, config.mil.learn_inner_lr
+    assert not any(additions) or row in paper_rows.TABLES["ladder"].values()
+
+
+def test_results_of_the_published_method_are_of_their_rows_and_in_the_docs():
+    root = pathlib.Path(__file__).parents[2]
+    for table_name, rows in paper_rows.TABLES.items():
+        folder = root / "experiments" / "results" / f"paper_{table_name}"
+        for name, row in rows.items():
+            for path in folder.glob(f"{name}-[0-9]-[0-9].json"):
+                shots, seed = (int(part) for part in path.stem.split("-")[-2:])
+                assert cells.Cells(folder, 1).is_done(path.stem, paper_rows.configure(row, shots, seed))
+    results = root / "experiments" / "results" / "paper_results"
+    printed = paper.markdown(paper_rows.TABLES["results"], cells.read(results))
+    assert printed in (root / "docs" / "paper.md").read_text()
