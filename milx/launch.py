@@ -31,7 +31,7 @@ def define_flags(values: flags.FlagValues = FLAGS) -> None:
     string(
         "preset",
         None,
-        "Hyperparameters: paper (as published; not for reach_state), fast (for an accelerator, its default), cpu "
+        "Hyperparameters: paper (the method as published), fast (for an accelerator, its default), cpu "
         "(smaller images and networks; the default without an accelerator). --config.path.to.field=value changes any "
         "of them.",
     )

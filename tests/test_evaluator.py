@@ -72,7 +72,7 @@ class Replay(Method):
     def init(self, key, whitening):
         return ()
 
-    def loss(self, params, batch):
+    def loss(self, params, batch, progress=1.0):
         raise NotImplementedError
 
     def adapt(self, params, demo):
