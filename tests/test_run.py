@@ -190,7 +190,7 @@ def test_evaluation_is_a_result_file(trained):
     assert high - low > 0.3, "six trials tell little"
     assert config_lib.from_dict(result["config"]) == trained.config
     assert result["dataset_hash"] == pytrees.fingerprint(trained.train)
-    assert set(result["baselines"]) == {"random", "task_blind", "expert"}
+    assert set(result["baselines"]) == {"random", "task_blind", "expert", "other_demo"}
     for rate in (result["success"], *result["baselines"].values()):
         assert rate * 6 == pytest.approx(round(rate * 6), abs=1e-5)
     clock = result["wall_clock_s"]
