@@ -74,7 +74,8 @@ def configure(env: str, method: str, preset: str, seed: int, steps: int | None) 
     config.train.steps = steps or STEPS[env]
     config.train.eval_every = min(4000, config.train.steps)
     config.train.redraw = False
-    config.optimizer.learning_rate = LEARNING_RATES[env][method]
+    if (method, preset) != ("mil", "paper"):  # which has its own
+        config.optimizer.learning_rate = LEARNING_RATES[env][method]
     if env == "reach" and config.train.query_frames is not None:
         config.train.query_frames = 8
         config.network.fc_layers = config.network.fc_layers[:1] * 3

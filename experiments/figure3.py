@@ -2,6 +2,7 @@
 
     python experiments/figure3.py                    # what is missing, then the figure
     python experiments/figure3.py --envs=push --tasks=48,192,768 --steps=15000 --out=results/figure3_push
+    python experiments/figure3.py --envs=reach --preset=paper --out=results/figure3_paper    # the published networks
     python experiments/figure3.py --preset=cpu --steps=200 --out=tiny --tasks=6,12 --seeds=1 --end_seeds=1
 
 Stopped and started again it goes on with its last checkpoint.
@@ -15,14 +16,9 @@ from typing import Any, NamedTuple
 import cells
 import matplotlib.pyplot as plt
 import options
+import table
 from absl import app, flags
 
-LABELS = {
-    "mil": "MIL + goal head",
-    "contextual": "contextual + goal head",
-    "lstm": "LSTM + goal head",
-    "lstm_attention": "LSTM with attention",
-}
 TITLES = {
     "reach": "vision, held-out colours",
     "reach_state": "state, held-out scenes",
@@ -78,9 +74,14 @@ def points(results: list[dict[str, Any]]) -> dict[tuple[str, str], dict[int, Poi
     return curves
 
 
+def _labels(results: list[dict[str, Any]]) -> dict[tuple[str, str], str]:
+    """What every method is called in every environment."""
+    return {(result["env"], result["method"]): table.method(result) for result in results}
+
+
 def markdown(results: list[dict[str, Any]]) -> str:
     """The figure as a table."""
-    curves = points(results)
+    curves, labels = points(results), _labels(results)
     sizes = sorted({size for curve in curves.values() for size in curve})
     lines = ["| | " + " | ".join(f"{size:,}" for size in sizes) + " |", "|---|" + "---|" * len(sizes)]
     for env, methods in cells.METHODS.items():
@@ -93,20 +94,20 @@ def markdown(results: list[dict[str, Any]]) -> str:
                 for size in sizes
             ]
             if curve:
-                lines.append(f"| {env}: {LABELS[method]} | {' | '.join(shown)} |")
+                lines.append(f"| {env}: {labels[env, method]} | {' | '.join(shown)} |")
     return "\n".join(lines)
 
 
 def draw(results: list[dict[str, Any]], path: pathlib.Path) -> None:
     """One panel for each environment: mean of the seeds, a band from the lowest to the highest interval's end."""
-    curves = points(results)
+    curves, labels = points(results), _labels(results)
     names = [env for env in cells.METHODS if any(env == key[0] for key in curves)]
     figure, axes = plt.subplots(1, len(names), figsize=(4.5 * len(names), 3.6), squeeze=False, layout="constrained")
     for axis, env in zip(axes[0], names, strict=True):
         for method in cells.METHODS[env]:
             curve = curves.get((env, method), {})
             mean, low, high = ([100 * point[i] for point in curve.values()] for i in range(3))
-            (line,) = axis.plot(list(curve), mean, marker="o", label=LABELS[method])
+            (line,) = axis.plot(list(curve), mean, marker="o", label=labels[env, method])
             axis.fill_between(list(curve), low, high, color=line.get_color(), alpha=0.2)
         floors = next(result["baselines"] for result in results if result["env"] == env)
         for name, style in (("random", ":"), ("task_blind", "--"), ("expert", "-.")):

@@ -9,11 +9,14 @@ import pathlib
 import statistics
 import sys
 
+LABELS = {"mil": "MIL", "lstm": "LSTM", "lstm_attention": "LSTM with attention"}
+
 
 def method(result: dict) -> str:
-    """What was trained, and whether with milx's goal head."""
-    name = {"mil": "MIL", "lstm": "LSTM"}.get(result["method"], result["method"])
-    return f"{name} + goal head" if result["config"]["network"]["goal_head"] else name
+    """What was trained, and whether with milx's goal head, which attention has no use for."""
+    name = result["method"]
+    has_goal_head = result["config"]["network"]["goal_head"] and name != "lstm_attention"
+    return LABELS.get(name, name) + (" + goal head" if has_goal_head else "")
 
 
 def setting(result: dict) -> str:

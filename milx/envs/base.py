@@ -84,7 +84,7 @@ class Env(abc.ABC):
     vision: bool = True
     object_indices: tuple[tuple[int, ...], ...] = ()
     tactics: tuple[float, ...] = (0.0,)
-    action_cost: float
+    action_cost: float = 1.0
 
     def __init__(self, model: mujoco.MjModel, image_shape: tuple[int, int] | None = None):
         self.mj_model = model
