@@ -99,7 +99,7 @@ def test_a_task_of_ones_own_is_planned_trained_and_judged(execute):
     notebook = execute("train_your_own_task", steps=4, tasks=2)
     found = re.search(r"success ([\d.]+)% of 8 trials; floors and ceiling: (\{.*\})", printed(notebook))
     assert 0 <= float(found.group(1)) <= 100
-    assert set(ast.literal_eval(found.group(2))) == {"random", "task_blind", "expert"}
+    assert set(ast.literal_eval(found.group(2))) == {"random", "task_blind", "expert", "other_demo"}
     (scene,) = code(notebook)[5].outputs
     image = iio.imread(base64.b64decode(scene.data["image/png"]))
     rows, columns = np.nonzero((image == 255).all(axis=-1))
