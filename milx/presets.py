@@ -28,17 +28,6 @@ def _reach_paper() -> Config:
     )
 
 
-def _reach_paper_cpu() -> Config:
-    config = _reach_paper()
-    config.env.image_shape = (32, 40)
-    config.data = DataConfig(tasks=1000, demos_per_task=5, plan_iterations=8, plan_batch=100)
-    config.train = TrainConfig(
-        steps=10_000, imitation_steps=2000, meta_batch=16, support_frames=8, query_frames=8, eval_every=2500
-    )
-    config.evaluation = EvalConfig(validation_tasks=25, baseline_trials=1, batch=25)
-    return config
-
-
 def _conditioned(learning_rate: float = 1e-3) -> OptimizerConfig:
     return OptimizerConfig(learning_rate=learning_rate, warmup=0.05, cosine=True, clip_norm=1.0)
 
@@ -229,7 +218,7 @@ def _without_pixels(config: Config) -> Config:
 
 
 PRESETS: dict[str, dict[str, Callable[[], Config]]] = {
-    "reach": {"paper": _reach_paper, "paper_cpu": _reach_paper_cpu, "fast": _reach_fast, "cpu": _reach_cpu},
+    "reach": {"paper": _reach_paper, "fast": _reach_fast, "cpu": _reach_cpu},
     "push": {"paper": _push_paper, "fast": _push_fast, "cpu": _push_cpu},
     "place": {"paper": _place_paper, "fast": _place_fast, "cpu": _place_cpu},
     "reach_state": {"paper": _reach_state_paper, "fast": _reach_state_fast, "cpu": _reach_state_cpu},

@@ -63,7 +63,7 @@ def test_unknown_field_is_refused_and_the_valid_ones_listed(values, message, val
     ("arguments", "message"),
     [
         ({"env": "nope"}, "env: got 'nope', expected one of reach, push, place, reach_state"),
-        ({"env": "reach", "preset": "nope"}, "preset: got 'nope', expected one of paper, paper_cpu, fast, cpu"),
+        ({"env": "reach", "preset": "nope"}, "preset: got 'nope', expected one of paper, fast, cpu"),
     ],
 )
 def test_unknown_env_or_preset_is_refused_and_the_valid_ones_listed(arguments, message):
