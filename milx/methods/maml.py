@@ -111,7 +111,7 @@ class MIL(Method):
 
         def adapts(path: tuple, _: jax.Array) -> bool:
             names = {entry.key for entry in path}
-            is_last = not names.isdisjoint(self.network.output_layers)
+            is_last = "controller" in names and not names.isdisjoint(self.network.output_layers)
             return {"anil": is_last, "boil": not is_last, "cavia": BIAS_TRANSFORMATION in names}.get(
                 self.config.variant, True
             )
