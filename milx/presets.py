@@ -33,9 +33,7 @@ def _conditioned(learning_rate: float = 1e-3) -> OptimizerConfig:
 
 
 def _reach_state_paper() -> Config:
-    config = _without_pixels(_reach_paper())
-    config.train.steps = 20_000
-    return config
+    return _without_pixels(_reach_paper())
 
 
 def _fast_mil() -> MILConfig:
