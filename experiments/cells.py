@@ -150,7 +150,7 @@ class Cells:
         env, method, evaluation = self._env(config), self._trainer(config).method, config.evaluation
         train, test = self._first_tasks(config), self._demos(config, "test")
         floors = self._once(
-            ("floors", config.env_name, config.env.action_cost),
+            ("floors", env),
             lambda: evaluator.baselines(env, test, evaluation, config.data, trial_key("test")),
         )
         clock.append(time.perf_counter())
@@ -279,9 +279,7 @@ class Cells:
         whole = dataclasses.replace(config, data=dataclasses.replace(config.data, tasks=self.capacity))
         env = self._env(config)
         which = config.seed if split == "train" else config.evaluation.shots
-        return self._once(
-            ("demos", config.env_name, config.env.action_cost, split, which), lambda: split_demos(env, whole, split)
-        )
+        return self._once(("demos", env, split, which), lambda: split_demos(env, whole, split))
 
     def _once(self, key: Any, make: Callable[[], Any]) -> Any:
         if key not in self._made:
