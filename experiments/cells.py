@@ -27,7 +27,7 @@ from milx.data.demos import DemoSet
 from milx.metrics import MetricsWriter
 from milx.policy import spec_of
 from milx.presets import make_config
-from milx.simulation import judge, split_demos, training_on, trial_key, validate
+from milx.simulation import result_of, split_demos, training_on, trial_key, validation_of
 from milx.trainer import Trainer, make_optimizer
 from milx.training import Training, check_steps, initial_state, restore_state, save_state
 from milx.types import Params
@@ -156,7 +156,7 @@ class Cells:
         clock.append(time.perf_counter())
         trained = self.train(name, config)
         clock.append(time.perf_counter())
-        _, found = judge(env, method, trained.params, test, config, floors)
+        _, found = result_of(env, method, trained.params, test, config, floors)
         clock.append(time.perf_counter())
         demos_s, _, evaluate_s = (later - earlier for earlier, later in itertools.pairwise(clock))
         seconds = {"demos": demos_s, **trained.seconds, "evaluate": trained.seconds["evaluate"] + evaluate_s}
@@ -239,7 +239,7 @@ class Cells:
             if step % config.train.eval_every == 0 or step == config.train.steps:
                 loss = float(metrics["loss"])
                 lap("train")
-                success, heard = validate(env, trainer.method, state.params, validation, evaluation)
+                success, heard = validation_of(env, trainer.method, state.params, validation, evaluation)
                 log.write(step, {"loss": loss, "validation_success": success, **heard})
                 lap("evaluate")
                 said = listening.describe(heard)

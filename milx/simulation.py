@@ -12,8 +12,7 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from milx import envs, evaluator, platform, pytrees, report, whitening
-from milx import validate as validate_lib
+from milx import envs, evaluator, platform, pytrees, report, validate, whitening
 from milx.config import Config, EvalConfig
 from milx.data import demos as demos_lib
 from milx.data.demos import DemoSet
@@ -65,7 +64,7 @@ def training_on(env: envs.Env, config: Config, train: DemoSet) -> Training:
     return Training(pytrees.fingerprint(train), statistics, lambda _: train, first_images)
 
 
-def validate(
+def validation_of(
     env: envs.Env, method: Method, params: Params, demos: DemoSet, config: EvalConfig
 ) -> tuple[float, dict[str, float]]:
     """Success in the trials of the validation tasks, and what `listening.measure` finds there."""
@@ -73,14 +72,12 @@ def validate(
     return float(trials.success.mean()), evaluator.listen(env, method, params, demos, config.shots)
 
 
-def judge(
+def result_of(
     env: envs.Env, method: Method, params: Params, demos: DemoSet, config: Config, floors: evaluator.Floors
 ) -> tuple[Trials, dict[str, Any]]:
     """The trials of the test tasks, and what the result file says of them."""
-    trials, misled = (
-        evaluator.run_trials(env, method, params, demos, config.evaluation, trial_key("test"), misled)
-        for misled in (False, True)
-    )
+    trials = evaluator.run_trials(env, method, params, demos, config.evaluation, trial_key("test"))
+    misled = evaluator.run_trials(env, method, params, demos, config.evaluation, trial_key("test"), misled=True)
     return trials, evaluator.describe(env, config, demos.task, trials, misled, floors)
 
 
@@ -104,7 +101,7 @@ class SimulatedRun(Run):
     metric = "success"
 
     def __init__(self, config: Config, workdir: str | pathlib.Path, console: Console | None = None):
-        validate_lib.check(config)
+        validate.check(config)
         if config.data.demos_per_task <= config.train.shots:
             expected = f"more than train.shots = {config.train.shots}: another one is the query"
             raise ValueError(f"data.demos_per_task: got {config.data.demos_per_task}, expected {expected}")
@@ -151,13 +148,13 @@ class SimulatedRun(Run):
         ]
 
     def _validate(self, params: Params) -> tuple[float, dict[str, float]]:
-        return validate(self.env, self.method, params, self._validation, self.config.evaluation)
+        return validation_of(self.env, self.method, params, self._validation, self.config.evaluation)
 
     def _judge(self, params: Params) -> tuple[dict[str, Any], Callable[[dict[str, Any]], None]]:
         config, test = self.config, self.demos("test")
         with self._clock("evaluate"):
             floors = evaluator.baselines(self.env, test, config.evaluation, config.data, trial_key("test"))
-            trials, found = judge(self.env, self.method, params, test, config, floors)
+            trials, found = result_of(self.env, self.method, params, test, config, floors)
 
         def draw(result: dict[str, Any]) -> None:
             metrics = report.read_metrics(self.folder / "metrics.jsonl")
