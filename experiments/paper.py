@@ -16,9 +16,10 @@ import matplotlib.pyplot as plt
 import options
 from absl import app, flags
 from paper_rows import TABLES, Row, configure
-from tables import interval
+from tables import chosen, interval
 
-flags.adopt_module_key_flags(options)
+for _name in ("seeds", "show", "out", "rows"):  # the others of options.py do nothing here
+    flags.declare_key_flag(_name)
 _TABLE = flags.DEFINE_enum("table", "results", list(TABLES), "Which table.")
 _SEED = flags.DEFINE_integer("first_seed", 0, "The first of the seeds.")
 _CURVES = flags.DEFINE_string("curves", None, "Where to draw the learning curves; default nowhere.")
@@ -26,7 +27,7 @@ _CURVES = flags.DEFINE_string("curves", None, "Where to draw the learning curves
 
 def main(_: list[str]) -> None:
     """Runs what is missing and prints a table."""
-    rows, folder = options.rows(TABLES[_TABLE.value]), options.folder(f"paper_{_TABLE.value}")
+    rows, folder = chosen(TABLES[_TABLE.value]), options.folder(f"paper_{_TABLE.value}")
     runners: dict[str, cells.Cells] = {}
     for seed in range(_SEED.value, _SEED.value + options.SEEDS.value):
         for name, row in {} if options.SHOW.value else rows.items():

@@ -11,6 +11,7 @@ from milx import config as config_lib
 from milx.config import Config
 
 flags.adopt_module_key_flags(options)
+_ROWS = flags.DEFINE_list("rows", None, "Which rows; default all.")
 
 
 class Row(NamedTuple):
@@ -55,13 +56,24 @@ def configure(env: str, row: Row, shots: int, seed: int) -> Config:
     return config
 
 
+def chosen(table: dict[str, Any]) -> dict[str, Any]:
+    """Those of a table's rows that were chosen, by name.
+
+    Raises:
+        ValueError: for a row that the table does not have; the message lists those that it has.
+    """
+    if unknown := sorted(set(_ROWS.value or ()) - set(table)):
+        raise ValueError(f"rows: got {unknown[0]!r}, expected some of {', '.join(table)}")
+    return {name: row for name, row in table.items() if _ROWS.value is None or name in _ROWS.value}
+
+
 def make(table: Table) -> None:
     """Runs what is missing, unless told only to show what there is, and prints a table for every criterion.
 
     Raises:
         ValueError: for a row that the table does not have; the message lists those that it has.
     """
-    rows = options.rows(table.rows)
+    rows = chosen(table.rows)
     folder, runners = options.folder(table.folder), {}
     seeds = range(options.SEEDS.value)
     for seed in seeds:
