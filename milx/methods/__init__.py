@@ -122,11 +122,18 @@ def _check_variant(config: Config) -> None:
         raise ValueError(f"mil.variant: got {variant!r}, expected one of {', '.join(VARIANTS)}")
     if variant == "cavia" and not config.network.bias_transformation:
         raise ValueError("network.bias_transformation: got 0, expected at least 1: mil.variant='cavia' adapts it alone")
+    if variant == "anil" and (config.network.heads == 2 or config.network.learned_loss):
+        expected = "one that acts and has the inner loss: mil.variant='anil' adapts it alone"
+        got = f"got {config.network.heads} with network.learned_loss={config.network.learned_loss!r}"
+        raise ValueError(f"network.heads: {got}, expected {expected}")
     if variant == "multi_step" and steps < 2:
         raise ValueError(f"mil.inner_steps: got {steps}, expected at least 2: mil.variant='multi_step' counts them all")
     if config.train.imitation_steps and config.method_name != "mil":
         got = f"got {config.train.imitation_steps} with method {config.method_name!r}"
         raise ValueError(f"train.imitation_steps: {got}, expected 0: only MIL has an inner step to leave out")
+    if config.train.imitation_steps >= config.train.steps:
+        got = f"got {config.train.imitation_steps}"
+        raise ValueError(f"train.imitation_steps: {got}, expected less than train.steps = {config.train.steps}")
 
 
 def _check_given(config: Config, spec: Spec) -> None:

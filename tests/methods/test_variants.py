@@ -109,6 +109,8 @@ def test_imitation_takes_no_inner_step_and_sees_support_and_query(batch):
     [
         ({"mil.variant": "reptile"}, "mil.variant: got 'reptile', expected one of maml, anil"),
         ({"mil.variant": "cavia", "network.bias_transformation": 0}, "network.bias_transformation: got 0"),
+        ({"mil.variant": "anil", "network.heads": 2}, "network.heads: got 2 with network.learned_loss=None"),
+        ({"train.imitation_steps": 30_000}, "train.imitation_steps: got 30000, expected less than train.steps = 30000"),
         ({"mil.variant": "multi_step"}, "mil.inner_steps: got 1, expected at least 2"),
         ({"train.imitation_steps": 5, "method_name": "lstm"}, "train.imitation_steps: got 5 with method 'lstm'"),
     ],
