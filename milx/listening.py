@@ -14,6 +14,7 @@ from milx import parallel, pytrees
 from milx.chunks import map_in_groups
 from milx.methods.base import Method
 from milx.types import Array, Demo, Observation, Params, TaskBatch
+from milx.whitening import MIN_STD
 
 MARGIN = 0.05
 """A policy listens if another task's demonstration makes its error larger by more than this part."""
@@ -31,8 +32,8 @@ _SMALLEST = 1e-3
 def measure(method: Method, params: Params, batch: TaskBatch, most: int | None = None) -> dict[str, jax.Array]:
     """Errors of the actions on the queries of N tasks, and the size of the step; to be called inside `jax.jit`.
 
-    Errors are squared, and divided by the variance of the queries' actions (entry by entry, then averaged): 1 is what
-    the best constant action has. On reach_state, which has three tasks, the other task is the same in a third of cases.
+    Errors are squared, and divided by the variance of the queries' actions (entry by entry, at least MIN_STD squared,
+    then averaged): 1 is what the best constant action has. On reach_state, which has three tasks, the other task is the same in a third of cases.
 
     Args:
         method: what adapts and acts.
@@ -65,7 +66,7 @@ def measure(method: Method, params: Params, batch: TaskBatch, most: int | None =
     if prior is not None:
         errors["no_demo"] = parallel.split_tasks(error_before, shared=1)(prior, batch.query)
     action = batch.query.action
-    variance = jnp.var(action.reshape(-1, action.shape[-1]), axis=0)
+    variance = jnp.maximum(jnp.var(action.reshape(-1, action.shape[-1]), axis=0), MIN_STD**2)
     found = {name: (value.mean(axis=0) / variance).mean() for name, value in errors.items()}
     return found if prior is None else found | _steps(prior["policy"], adapted["policy"])
 

@@ -75,6 +75,16 @@ def test_errors_are_those_of_a_loop_over_the_tasks(batch, most):
     assert listening.is_deaf(deaf)
 
 
+def test_an_entry_that_never_changes_has_a_finite_error(batch):
+    """It is divided by the least variance of the whitening, 1e-6."""
+    still = dataclasses.replace(batch.query, action=batch.query.action.at[..., 1].set(0.5))
+    shown = dataclasses.replace(batch.support, action=batch.support.action.at[..., 1].set(0.503))
+    found = measure(Mean(), jnp.zeros(ACTION), TaskBatch(shown, still))
+    moving = np.asarray(batch.query.action)[..., 0], np.asarray(batch.support.action)[..., 0].mean(axis=(1, 2))
+    error = np.mean((moving[1][:, None, None] - moving[0]) ** 2) / moving[0].var()
+    assert found["own_demo"] == pytest.approx((error + 0.003**2 / 1e-6) / 2, rel=1e-3)
+
+
 PLAIN = Whitening(np.zeros(STATE), np.ones(STATE), np.zeros(ACTION), np.ones(ACTION))
 CONSTANT = PolicyNetwork(
     init=lambda key: {"a": jnp.asarray(THETA)},
