@@ -139,15 +139,16 @@ class Trainer:
 
     def _gradient(self, params: Params, batch: TaskBatch, step: jax.Array) -> tuple[Params, dict[str, jax.Array]]:
         """That of plain imitation for the first updates, if so configured, and of the meta-objective after them."""
+        first = self.train.imitation_steps
 
         def meta_objective(params: Params, batch: TaskBatch) -> tuple[jax.Array, dict[str, jax.Array]]:
-            return self.method.loss(params, batch, step / self.train.steps)
+            return self.method.loss(params, batch, jnp.maximum(step - first, 0) / (self.train.steps - first))
 
-        if not self.train.imitation_steps:
+        if not first:
             return meta_gradient(meta_objective, params, batch)
         losses = self.method.imitation, meta_objective
         branches = [functools.partial(meta_gradient, loss) for loss in losses]
-        return jax.lax.cond(step < self.train.imitation_steps, *branches, params, batch)
+        return jax.lax.cond(step < first, *branches, params, batch)
 
     @functools.partial(jax.jit, static_argnums=(0, 4))
     def run(self, state: TrainState, data: Any, key: jax.Array, steps: int) -> tuple[TrainState, dict[str, jax.Array]]:

@@ -131,3 +131,14 @@ def test_a_run_imitates_first_and_measures_the_batch_that_comes_next(batch):
     following = sample(batch, trainer._keys(key, jnp.asarray(3)))
     expected = measure(method, {**params, "policy": {"a": theta}}, following)
     assert {name: float(metrics[name]) for name in expected} == pytest.approx(expected, rel=1e-4)
+
+
+def test_progress_counts_the_updates_with_an_inner_step(batch):
+    """The multi-step loss has equal weights in the first of them, whenever that is."""
+    method = MIL(MILConfig(inner_lr=0.1, inner_clip=1e9, inner_steps=2, variant="multi_step"), CONSTANT)
+    params = {"policy": {"a": jnp.asarray(THETA)}, "whitening": PLAIN}
+    trainer = Trainer(None, method, TrainConfig(steps=10, imitation_steps=6, meta_batch=TASKS), optax.sgd(0.1))
+    for step, progress in ((6, 0.0), (8, 0.5)):
+        _, metrics = jax.jit(trainer._gradient)(params, batch, jnp.asarray(step))
+        expected = method.loss(params, batch, progress)[1]["loss"]
+        np.testing.assert_allclose(metrics["loss"], expected, rtol=1e-5)
