@@ -93,15 +93,21 @@ def test_examples_of_a_batch_do_not_see_each_other(inputs, changes):
         assert np.abs(np.diff(parts, axis=0)).min() > 1e-6
 
 
-def test_one_head_answers_both_losses_and_two_heads_share_all_but_the_last_layer(inputs):
+def test_one_head_answers_both_losses(inputs):
     network, params = build()
     output = network.apply(params, *inputs)
     np.testing.assert_array_equal(output.action, output.inner_action)
 
-    network, params = build(heads=2)
-    output = network.apply(params, *inputs)
-    layers = params["controller"]
-    swapped = with_layers(params, Dense_1=layers["Dense_2"], Dense_2=layers["Dense_1"])
+
+@pytest.mark.parametrize(
+    ("changes", "acting", "inner"),
+    [({"heads": 2}, "Dense_2", "Dense_1"), ({"inner_first_layer": True}, "Dense_0", "inner_first")],
+    ids=["two heads", "two first layers"],
+)
+def test_the_two_losses_share_all_but_one_layer(inputs, changes, acting, inner):
+    network, params = build(**changes)
+    output, layers = network.apply(params, *inputs), params["controller"]
+    swapped = with_layers(params, **{inner: layers[acting], acting: layers[inner]})
     np.testing.assert_array_equal(network.apply(swapped, *inputs).action, output.inner_action)
     np.testing.assert_array_equal(network.apply(swapped, *inputs).inner_action, output.action)
     assert np.abs(output.action - output.inner_action).min() > 1e-6
@@ -118,15 +124,6 @@ def test_the_prediction_of_the_goal_reaches_the_action(inputs):
     np.testing.assert_allclose(moved.goal.mean, plain.goal.mean + shift, rtol=1e-9)
     np.testing.assert_allclose(moved.action, folded.action, rtol=1e-9)
     assert np.abs(moved.action - plain.action).max() > 1e-3
-
-
-def test_the_inner_loss_may_have_a_first_layer_of_its_own(inputs):
-    network, params = build(inner_first_layer=True)
-    output, layers = network.apply(params, *inputs), params["controller"]
-    swapped = with_layers(params, inner_first=layers["Dense_0"], Dense_0=layers["inner_first"])
-    np.testing.assert_array_equal(network.apply(swapped, *inputs).action, output.inner_action)
-    np.testing.assert_array_equal(network.apply(swapped, *inputs).inner_action, output.action)
-    assert np.abs(output.action - output.inner_action).min() > 1e-6
 
 
 def test_the_first_image_of_an_episode_tells_the_target_of_all_its_steps(inputs):
