@@ -33,7 +33,8 @@ def measure(method: Method, params: Params, batch: TaskBatch, most: int | None =
     """Errors of the actions on the queries of N tasks, and the size of the step; to be called inside `jax.jit`.
 
     Errors are squared, and divided by the variance of the queries' actions (entry by entry, at least MIN_STD squared,
-    then averaged): 1 is what the best constant action has. On reach_state, which has three tasks, the other task is the same in a third of cases.
+    then averaged): 1 is what the best constant action has. On reach_state, which has three tasks, the other task is the
+    same in a third of cases.
 
     Args:
         method: what adapts and acts.
