@@ -3,7 +3,7 @@
 python -m milx.export runs/reach-mil-fast-0 exported
 
 adapt.bin, act.bin      the programs (jax.export), with nothing of milx, Flax or MuJoCo in them
-params.npz              what was learnt, whitening included
+params.npz              what was learnt, whitening included, and the memory at the start of an episode
 policy.json             the shapes that the programs want
 policy.py               loads all that: `milx/exported.py`
 """
@@ -59,16 +59,22 @@ def export(policy: Policy, out: str | pathlib.Path, shots: int = 1) -> None:
     }
     task_params = jax.eval_shape(learn, policy.params, shapes["adapt"])
     task_structure = jax.tree.structure(task_params)
+    memory, memory_structure = jax.tree.flatten(policy.initial_memory)
 
     def seen(observation: dict[str, jax.Array]) -> Observation:
         return Observation(**_with_state(observation, policy.spec))
 
-    def act(leaves: list[jax.Array], observation: dict[str, jax.Array]) -> jax.Array:
-        return policy.method.act(jax.tree.unflatten(task_structure, leaves), seen(observation), ())[0]
+    def act(
+        leaves: list[jax.Array], observation: dict[str, jax.Array], memory: list[jax.Array]
+    ) -> tuple[jax.Array, list[jax.Array]]:
+        task_params = jax.tree.unflatten(task_structure, leaves)
+        remembered = jax.tree.unflatten(memory_structure, memory)
+        action, remembered = policy.method.act(task_params, seen(observation), remembered)
+        return action, jax.tree.leaves(remembered)
 
     programs = {
         "adapt": _program(adapt, leaves, shapes["adapt"]),
-        "act": _program(act, jax.tree.leaves(task_params), shapes["act"]),
+        "act": _program(act, jax.tree.leaves(task_params), shapes["act"], memory),
     }
     partial = folder.with_name(f"{folder.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
@@ -76,6 +82,7 @@ def export(policy: Policy, out: str | pathlib.Path, shots: int = 1) -> None:
     for name, program in programs.items():
         (partial / f"{name}.bin").write_bytes(program)
     arrays: dict[str, Any] = {f"{i:04d}": np.asarray(leaf) for i, leaf in enumerate(leaves)}
+    arrays |= {f"memory{i:04d}": np.asarray(leaf) for i, leaf in enumerate(memory)}
     np.savez(partial / "params.npz", **arrays)
     (partial / "policy.json").write_text(json.dumps(sizes, indent=1) + "\n")
     shutil.copyfile(exported.__file__, partial / "policy.py")

@@ -25,13 +25,18 @@ class Policy:
 
     Attributes:
         sizes: shapes [K, T, ...] of what `adapt` wants, and [...] of what `act` wants, by field.
+        params: what was learnt.
+        initial_memory: what the policy remembers at the start of an episode; empty for most policies.
     """
 
     def __init__(self, folder):
         folder = pathlib.Path(folder)
         self.sizes = json.loads((folder / "policy.json").read_text())
         with np.load(folder / "params.npz", allow_pickle=False) as arrays:
-            self.params = [jnp.asarray(arrays[f"{i:04d}"]) for i in range(len(arrays))]
+            self.params, self.initial_memory = (
+                [jnp.asarray(arrays[name]) for name in sorted(arrays) if name.startswith("memory") == of_memory]
+                for of_memory in (False, True)
+            )
         self._adapt, self._act = (
             jax.jit(jax.export.deserialize((folder / f"{name}.bin").read_bytes()).call) for name in ("adapt", "act")
         )
@@ -67,9 +72,22 @@ class Policy:
         """The action [A] for one observation: "image" uint8 [H, W, 3] and "state" [S], as far as it wants them.
 
         Raises:
+            ValueError: for a field that is missing, not wanted, or of a wrong shape or type; for a policy that
+                remembers.
+        """
+        if self.initial_memory:
+            raise ValueError("memory: missing, expected `step`: this policy remembers what it saw first")
+        return self.step(task_params, self.initial_memory, **observation)[0]
+
+    def step(self, task_params, memory, **observation):
+        """The action, as in `act`, and what the policy remembers for the next observation.
+
+        `memory` is `initial_memory` at the first time step of an episode, and then what the step before returned.
+
+        Raises:
             ValueError: for a field that is missing, not wanted, or of a wrong shape or type.
         """
-        return self._act(task_params, self._checked(observation, self.sizes["act"], lead=0))
+        return self._act(task_params, self._checked(observation, self.sizes["act"], lead=0), memory)
 
     @staticmethod
     def _checked(values, wanted, lead):

@@ -15,7 +15,7 @@ from milx.checkpoint import Checkpoints
 from milx.config import GIVEN
 from milx.goals import goals
 from milx.methods import Method, Spec
-from milx.types import Demo, Observation, Params
+from milx.types import Demo, Memory, Observation, Params
 from milx.whitening import Whitening
 
 SPEC_FILE = "spec.json"
@@ -73,17 +73,38 @@ class Policy:
         """The action [A], in the environment's units, for one observation; jitted.
 
         Raises:
+            ValueError: for a field that is missing or has a wrong shape or type, or a value that is not finite; for a
+                policy that remembers.
+        """
+        if jax.tree.leaves(self.initial_memory):
+            raise ValueError("memory: missing, expected `Policy.step`: this policy remembers what it saw first")
+        return self.step(task_params, observation, self.initial_memory)[0]
+
+    def step(self, task_params: Params, observation: Observation, memory: Memory) -> tuple[jax.Array, Memory]:
+        """The action, as in `act`, and what the policy remembers for the next observation; jitted.
+
+        Args:
+            task_params: from `adapt`.
+            observation: what the policy sees.
+            memory: `initial_memory` at the first time step of an episode, and then what the step before returned.
+
+        Raises:
             ValueError: for a field that is missing or has a wrong shape or type, or a value that is not finite.
         """
-        return self._act(task_params, check_observation(observation, self.spec))
+        return self._step(task_params, check_observation(observation, self.spec), memory)
+
+    @functools.cached_property
+    def initial_memory(self) -> Memory:
+        """What the policy remembers at the start of an episode; empty for most policies."""
+        return self.method.initial_memory(jax.random.key(0))
 
     @functools.cached_property
     def _adapt(self) -> Any:
         return jax.jit(self.method.adapt)
 
     @functools.cached_property
-    def _act(self) -> Any:
-        return jax.jit(lambda task_params, observation: self.method.act(task_params, observation, ())[0])
+    def _step(self) -> Any:
+        return jax.jit(self.method.act)
 
 
 def load(run: str | pathlib.Path) -> Policy:

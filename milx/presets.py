@@ -243,6 +243,7 @@ def make_config(env: str, method: str = "mil", preset: str = "fast", seed: int =
     if method != "mil":
         config.train.support_frames = SUPPORT_FRAMES.get(method, config.train.support_frames)
         config.train.imitation_steps, config.network.heads = 0, 1  # there is no inner step
+        config.network.target_head = False
     return config
 
 

@@ -20,9 +20,10 @@ from milx.data.dataset import DataSet, spread
 from milx.data.recorded import MOST_DEMOS, Recorded, Shards, load, sample_batch, with_goals
 from milx.methods import Method, Spec
 from milx.policy import SPEC_FILE
+from milx.rollout import replay
 from milx.run import Run
 from milx.training import Training
-from milx.types import Demo, Observation, Params, TaskBatch
+from milx.types import Demo, Params, TaskBatch
 
 RECORDED = "recorded"
 """The value of `config.env_name` that stands for recorded demonstrations."""
@@ -255,9 +256,7 @@ def task_errors(
         return (jnp.square((action - queries.demo.action) / scale).mean(axis=(1, 2)) * weight).sum()
 
     def act(task_params: Params) -> jax.Array:
-        one = lambda image, state: method.act(task_params, Observation(image, state), ())[0]  # noqa: E731
-        seen = queries.demo.image, queries.demo.state
-        return jax.lax.map(lambda demo: jax.vmap(one)(*demo), seen)
+        return jax.lax.map(functools.partial(replay, method, task_params), queries.demo)
 
     errors = {"after": error(act(method.adapt(params, support))), "mean_action": error(mean)}
     if (prior := method.unadapted(params)) is not None:

@@ -128,6 +128,9 @@ def _check_variant(config: Config) -> None:
         raise ValueError(f"network.heads: {got}, expected {expected}")
     if variant == "multi_step" and steps < 2:
         raise ValueError(f"mil.inner_steps: got {steps}, expected at least 2: mil.variant='multi_step' counts them all")
+    if config.network.target_head and config.method_name != "mil":
+        got = f"got True with method {config.method_name!r}"
+        raise ValueError(f"network.target_head: {got}, expected False: only MIL remembers the first image's target")
     if config.train.imitation_steps and config.method_name != "mil":
         got = f"got {config.train.imitation_steps} with method {config.method_name!r}"
         raise ValueError(f"train.imitation_steps: {got}, expected 0: only MIL has an inner step to leave out")

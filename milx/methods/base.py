@@ -36,7 +36,7 @@ class Method(abc.ABC):
         """Learns a task from demonstrations with axes [K, T, ...]; returns `task_params`."""
 
     def unadapted(self, params: Params) -> Params | None:
-        """`task_params` before any demonstration; None for a method that cannot act without one."""
+        """`task_params` before any demonstration, with the structure that `adapt` returns; None if there are none."""
         del params
         return None
 

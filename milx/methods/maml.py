@@ -172,10 +172,10 @@ class MIL(Method):
     def act(self, task_params: Params, observation: Observation, memory: Memory) -> tuple[jax.Array, Memory]:
         """The adapted network's action for one observation. The memory is what a target head saw in the first one."""
         whitening, batch = task_params["whitening"], jax.tree.map(lambda x: x[None], observation)
-        remembered = None if isinstance(memory, tuple) else memory[None]
-        output = self.network.apply(task_params["policy"], batch.image, whitening.state(batch.state), 1, remembered)
+        target = memory[None] if self.network.has_target else None
+        output = self.network.apply(task_params["policy"], batch.image, whitening.state(batch.state), 1, target)
         action = whitening.unwhiten_action(output.action[0])
-        return action, memory if remembered is None or output.target is None else output.target[0]
+        return action, memory if output.target is None else output.target[0]
 
     def initial_memory(self, key: jax.Array) -> Memory:
         """Nothing; for a target head the target [G], not known yet (NaN)."""

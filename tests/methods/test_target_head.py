@@ -1,16 +1,21 @@
 """The paper's prediction of the target: what a policy that acts remembers is what it was trained with."""
 
-import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from milx.config import MILConfig, NetworkConfig
+from milx import exported, listening
+from milx.config import Config, EnvConfig, MILConfig, NetworkConfig
+from milx.export import export
+from milx.methods import Spec
 from milx.methods.maml import MIL
 from milx.networks.policy import make_policy
-from milx.types import Demo, Observation
+from milx.policy import Policy
+from milx.rollout import replay
+from milx.types import Demo, Observation, TaskBatch
 from milx.whitening import Whitening
 
 IMAGE_SHAPE, STATE, ACTION, STEPS, INDICES = (8, 10), 4, 2, 5, (1, 3)
@@ -54,12 +59,51 @@ def test_acting_from_the_first_image_on_is_what_the_loss_sees(case):
     np.testing.assert_allclose(loss, parts["action_loss"] + 0.7 * parts["target_loss"], rtol=1e-12)
 
 
-def test_a_policy_without_a_memory_reads_the_target_off_every_image(case):
+def test_a_replay_is_a_loop_over_the_observations(case):
     method, params, demo = case
-    one = Observation(demo.image[0, 3], demo.state[0, 3])
-    action, memory = method.act(params, one, ())
-    first = jax.tree.map(lambda x: x[:, 3:4], demo)
-    _, parts = method.imitation_loss(params["policy"], WHITENING, dataclasses.replace(first, goal=None))
-    white = (np.asarray(action) - np.asarray(first.action[0, 0])) / WHITENING.action_scale
-    assert memory == () and "target_loss" not in parts
-    np.testing.assert_allclose(parts["action_loss"], np.mean(white**2), rtol=1e-9)
+    one = jax.tree.map(lambda x: x[0], demo)
+    memory, actions = method.initial_memory(jax.random.key(0)), []
+    for t in range(STEPS):
+        action, memory = method.act(params, Observation(one.image[t], one.state[t]), memory)
+        actions.append(action)
+    found = replay(method, params, one)
+    np.testing.assert_allclose(found, actions, rtol=1e-12)
+    alone = method.act(params, Observation(one.image[3], one.state[3]), method.initial_memory(jax.random.key(0)))[0]
+    assert np.abs(alone - found[3]).max() > 1e-3
+
+
+def test_listening_remembers_the_first_image(case):
+    method, params, demo = case
+    twice = jax.tree.map(lambda x: jnp.stack([x, x]), demo)
+    found = jax.jit(functools.partial(listening.measure, method))(params, TaskBatch(twice, twice))
+    error = np.square(replay(method, params, jax.tree.map(lambda x: x[0], demo)) - demo.action[0]).mean(axis=0)
+    np.testing.assert_allclose(found["no_demo"], (error / np.var(demo.action[0], axis=0)).mean(), rtol=1e-9)
+
+
+def test_policies_with_a_memory_act_step_by_step(case, tmp_path):
+    """The policy, and its export, act as in the loop; without their memory they do not act at all."""
+    method, _, demo = case
+    config = Config(env=EnvConfig(image_shape=IMAGE_SHAPE))
+    config.recorded.path, config.recorded.horizon = "a data set", STEPS
+    spec = Spec(IMAGE_SHAPE, STATE, ACTION, None, INDICES)
+    with jax.enable_x64(False):
+        single = lambda tree: jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), tree)  # noqa: E731
+        params = method.init(jax.random.key(0), single(WHITENING))
+        policy = Policy(method, spec, params, config)
+        export(policy, tmp_path / "out")
+        alone = exported.Policy(tmp_path / "out")
+        one = {"image": np.asarray(demo.image[0]), "state": np.asarray(demo.state[0], np.float32)}
+        shown = one | {"action": np.asarray(demo.action[0], np.float32)}
+        learnt = policy.adapt(policy.params, Demo(**shown)), alone.adapt(**shown)
+        expected = replay(method, learnt[0], Demo(**jax.tree.map(jnp.asarray, one)))
+        with pytest.raises(ValueError, match=r"memory: missing, expected `Policy\.step`"):
+            policy.act(learnt[0], Observation(one["image"][0], one["state"][0]))
+        with pytest.raises(ValueError, match="memory: missing, expected `step`"):
+            alone.act(learnt[1], image=one["image"][0], state=one["state"][0])
+        memories, found = [policy.initial_memory, alone.initial_memory], []
+        for image, state in zip(one["image"], one["state"], strict=True):
+            first, memories[0] = policy.step(learnt[0], Observation(image, state), memories[0])
+            second, memories[1] = alone.step(learnt[1], memories[1], image=image, state=state)
+            found.append((first, second))
+        for each in zip(*found, strict=True):
+            np.testing.assert_allclose(np.stack(each), expected, atol=1e-5)

@@ -112,6 +112,7 @@ def test_imitation_takes_no_inner_step_and_sees_support_and_query(batch):
         ({"mil.variant": "anil", "network.heads": 2}, "network.heads: got 2 with network.learned_loss=None"),
         ({"train.imitation_steps": 30_000}, "train.imitation_steps: got 30000, expected less than train.steps = 30000"),
         ({"mil.variant": "multi_step"}, "mil.inner_steps: got 1, expected at least 2"),
+        ({"network.target_head": True, "method_name": "lstm"}, "network.target_head: got True with method 'lstm'"),
         ({"train.imitation_steps": 5, "method_name": "lstm"}, "train.imitation_steps: got 5 with method 'lstm'"),
     ],
 )
