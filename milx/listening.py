@@ -13,17 +13,12 @@ import jax.numpy as jnp
 from milx import parallel, pytrees
 from milx.chunks import map_in_groups
 from milx.methods.base import Method
-from milx.types import Array, Demo, Observation, Params, TaskBatch
+from milx.rollout import replay
+from milx.types import Demo, Params, TaskBatch
 from milx.whitening import MIN_STD
 
 MARGIN = 0.05
 """A policy listens if another task's demonstration makes its error larger by more than this part."""
-ADVICE = (
-    "the policy does not listen: another task's demonstration does as well as its own. Try imitation before the first "
-    "inner step (train.imitation_steps), more tasks in a meta-batch (train.meta_batch), whitened actions "
-    "(mil.whiten_actions), another mil.inner_lr, or an expert that moves at once (env.action_cost)"
-)
-"""What a run says that does not listen, and what to try."""
 ERRORS = {"own_demo": "its own", "other_demo": "another task's", "no_demo": "no"}
 """The errors that `measure` finds, by whose demonstration the policy saw."""
 _SMALLEST = 1e-3
@@ -39,14 +34,14 @@ def measure(method: Method, params: Params, batch: TaskBatch, most: int | None =
     Args:
         method: what adapts and acts.
         params: what it has learnt.
-        batch: N tasks, at least two that are different.
+        batch: N tasks, of which neighbours should differ.
         most: tasks that a device adapts to at once; all if None.
 
     Returns:
-        "own_demo", "other_demo" and, where a policy can act without a demonstration, "no_demo": the errors after
-        adaptation to the task's demonstration, to that of the next task in the batch, and before. For every tensor
-        that the step changes, "step/<name>": the root mean square of its change, by that of the tensor (or 1e-3 where
-        that is smaller), averaged over the tasks.
+        "own_demo", "other_demo" (with two tasks or more) and, where a policy can act without a demonstration,
+        "no_demo": the errors after adaptation to the task's demonstration, to that of the next task in the batch, and
+        before. There, too, "step/<name>" for every tensor of the policy: the root mean square of its change, divided by
+        that of the tensor (or by 1e-3 where that is smaller), averaged over the tasks.
     """
     most = most or len(batch.query.action)
 
@@ -60,21 +55,31 @@ def measure(method: Method, params: Params, batch: TaskBatch, most: int | None =
         return map_in_groups(functools.partial(_squared_error, method, prior), (query,), most)
 
     adapted = parallel.split_tasks(adapt, shared=1)(params, batch.support)
-    of_next = jax.tree.map(lambda x: jnp.roll(x, -1, axis=0), adapted)
     on_each = parallel.split_tasks(error)
-    errors = {"own_demo": on_each(adapted, batch.query), "other_demo": on_each(of_next, batch.query)}
+    errors = {"own_demo": on_each(adapted, batch.query)}
+    if len(batch.query.action) > 1:
+        of_next = jax.tree.map(lambda x: jnp.roll(x, -1, axis=0), adapted)
+        errors["other_demo"] = on_each(of_next, batch.query)
     prior = method.unadapted(params)
     if prior is not None:
         errors["no_demo"] = parallel.split_tasks(error_before, shared=1)(prior, batch.query)
     action = batch.query.action
     variance = jnp.maximum(jnp.var(action.reshape(-1, action.shape[-1]), axis=0), MIN_STD**2)
     found = {name: (value.mean(axis=0) / variance).mean() for name, value in errors.items()}
-    return found if prior is None else found | _steps(prior["policy"], adapted["policy"])
+    return found if prior is None else found | _steps(prior, adapted)
 
 
 def is_deaf(found: dict[str, float]) -> bool:
     """Whether the errors of `measure` say that the demonstration makes no difference."""
     return "other_demo" in found and found["other_demo"] <= (1 + MARGIN) * found["own_demo"]
+
+
+def advice(has_inner_step: bool) -> str:
+    """What a run says that does not listen, and what to try."""
+    remedies = "more tasks in a meta-batch (train.meta_batch), or whitened actions (mil.whiten_actions)"
+    if has_inner_step:
+        remedies = f"imitation before the first inner step (train.imitation_steps), another mil.inner_lr, {remedies}"
+    return f"the policy does not listen: another task's demonstration does as well as its own. Try {remedies}"
 
 
 def describe(found: dict[str, float]) -> str:
@@ -85,11 +90,8 @@ def describe(found: dict[str, float]) -> str:
 
 def _squared_error(method: Method, task_params: Params, query: Demo) -> jax.Array:
     """[A] mean over the time steps of demonstrations [Q, T, ...]."""
-
-    def act(image: Array, state: Array) -> jax.Array:
-        return method.act(task_params, Observation(image, state), ())[0]
-
-    return jnp.square(jax.vmap(jax.vmap(act))(query.image, query.state) - query.action).mean(axis=(0, 1))
+    action = jax.vmap(functools.partial(replay, method, task_params))(query)
+    return jnp.square(action - query.action).mean(axis=(0, 1))
 
 
 def _steps(before: Params, after: Params) -> dict[str, jax.Array]:
@@ -98,4 +100,5 @@ def _steps(before: Params, after: Params) -> dict[str, jax.Array]:
 
     moved = jax.tree.map(lambda x, y: jax.vmap(lambda y: size(y - x))(y).mean(), before, after)
     tensors, changes = pytrees.leaves(before), pytrees.leaves(moved)
-    return {f"step/{name}": changes[name] / jnp.maximum(size(x), _SMALLEST) for name, x in tensors.items() if x.size}
+    learnt = {name: x for name, x in tensors.items() if x.size and not name.startswith("whitening.")}
+    return {f"step/{name}": changes[name] / jnp.maximum(size(x), _SMALLEST) for name, x in learnt.items()}

@@ -7,6 +7,7 @@ from typing import Any
 
 import imageio.v3 as iio
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from milx import listening
@@ -31,11 +32,7 @@ def learning_curve(metrics: list[dict[str, Any]], evaluation: dict[str, Any], pa
     """
     figure = Figure(figsize=(14, 3.6), layout="constrained")
     left, middle, right = figure.subplots(1, 3)
-    left.set(xlabel="meta-updates", ylabel="squared error of the actions (1: a constant)", title="does it listen?")
-    for (name, words), color in zip(listening.ERRORS.items(), ("tab:blue", "tab:orange", "0.6"), strict=True):
-        left.plot(*_curve(metrics, name), color=color, lw=1, label=f"{words} demonstration")
-    left.set_ylim(0, min(left.get_ylim()[1], 2.0))
-    left.legend(fontsize=8, loc="upper right")
+    _listening(left, metrics)
     if any("goal_loss" in line for line in metrics):
         axis = left.twinx()
         axis.plot(*_curve(metrics, "goal_loss"), color="tab:red", lw=1)
@@ -45,7 +42,7 @@ def learning_curve(metrics: list[dict[str, Any]], evaluation: dict[str, Any], pa
         steps, sizes = _curve(metrics, name)
         moved = [(step, size) for step, size in zip(steps, sizes, strict=True) if size > 0]
         if moved and not name.endswith(("bias", "centre")):
-            middle.plot(*zip(*moved, strict=True), lw=1, label=name.removeprefix("step/"))
+            middle.plot(*zip(*moved, strict=True), lw=1, label=name.removeprefix("step/policy."))
     if middle.lines:
         middle.legend(fontsize=5)
     steps, valid = _curve(metrics, "validation_success")
@@ -62,6 +59,18 @@ def learning_curve(metrics: list[dict[str, Any]], evaluation: dict[str, Any], pa
     figure.savefig(path, dpi=120)
 
 
+def _listening(axis: Axes, metrics: list[dict[str, Any]]) -> None:
+    """Plots the errors of `listening.measure`: on training tasks as lines, on validation tasks as dots."""
+    axis.set(xlabel="meta-updates", ylabel="squared error of the actions (1: a constant)", title="does it listen?")
+    for (name, words), color in zip(listening.ERRORS.items(), ("tab:blue", "tab:orange", "0.6"), strict=True):
+        if any(name in line for line in metrics):
+            axis.plot(*_curve(metrics, name), color=color, lw=1, label=f"{words} demonstration")
+            axis.plot(*_curve(metrics, f"validation_{name}"), "o", color=color, ms=3)
+    axis.plot([], [], "o", color="black", ms=3, label="the same on validation tasks")
+    axis.set_ylim(0, min(axis.get_ylim()[1], 2.0))
+    axis.legend(fontsize=8, loc="upper right")
+
+
 def _curve(metrics: list[dict[str, Any]], name: str) -> tuple[list[int], list[float]]:
     """The steps whose line has this number, and the numbers."""
     lines = [line for line in metrics if name in line]
@@ -69,19 +78,18 @@ def _curve(metrics: list[dict[str, Any]], name: str) -> tuple[list[int], list[fl
 
 
 def action_errors(metrics: list[dict[str, Any]], evaluation: dict[str, Any], path: pathlib.Path) -> None:
-    """Plots the meta-objective and the validation score, and the errors of the actions on test tasks.
+    """Plots whether the policy listens, the validation score, and the errors of the actions on test tasks.
 
     Args:
-        metrics: lines with "step" and "action_loss", or "validation_score".
+        metrics: lines with "step" and what `listening.measure` found, or "validation_score".
         evaluation: the run's evaluation.json.
         path: image file to write.
     """
     figure = Figure(figsize=(10, 3.6), layout="constrained")
     left, middle, right = figure.subplots(1, 3)
-    for axis, name, title in ((left, "action_loss", "after adaptation"), (middle, "validation_score", "validation")):
-        values = [(line["step"], line[name]) for line in metrics if name in line]
-        axis.plot(*zip(*values, strict=True), "-o" if axis is middle else "-", lw=1)
-        axis.set(xlabel="meta-updates", ylabel=name.replace("_", " "), title=title)
+    _listening(left, metrics)
+    middle.plot(*_curve(metrics, "validation_score"), "-o", lw=1)
+    middle.set(xlabel="meta-updates", ylabel="validation score", title="validation")
     errors = evaluation["action_error"]
     names = [name for name in ("mean_action", "before", "other_task", "after") if name in errors]
     bars = right.bar([name.replace("_", "\n") for name in names], [errors[name] for name in names], color="0.7")

@@ -163,7 +163,7 @@ class Run(abc.ABC):
             )
             meta_updates = int(state.step) - config.imitation_steps
             if 5 * meta_updates >= config.steps - config.imitation_steps and listening.is_deaf(heard):
-                self._warn(listening.ADVICE)
+                self._warn(listening.advice(has_inner_step=self.config.method_name == "mil"))
             with stop.deferred():
                 return save(state, score, checkpoints.replace)
 

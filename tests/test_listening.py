@@ -70,6 +70,8 @@ def test_errors_are_those_of_a_loop_over_the_tasks(batch, most):
     expected = {"own_demo": error(lambda i: i), "other_demo": error(lambda i: (i + 1) % TASKS)}
     assert found == pytest.approx(expected, rel=1e-5)
     assert not listening.is_deaf(found)
+    alone = measure(Mean(), jnp.zeros(ACTION), jax.tree.map(lambda x: x[:1], batch))
+    assert set(alone) == {"own_demo"}  # there is no other task
     deaf = measure(Mean(deaf=True), jnp.zeros(ACTION), batch, most)
     assert deaf["own_demo"] == deaf["other_demo"]
     assert listening.is_deaf(deaf)
@@ -101,7 +103,8 @@ def test_the_size_of_the_step_is_relative_to_the_tensor(batch):
     found = measure(method, {"policy": {"a": jnp.asarray(THETA)}, "whitening": PLAIN}, batch)
     way = np.asarray(batch.support.action).mean(axis=(1, 2)) - THETA
     size = lambda x: np.sqrt(np.mean(x**2, axis=-1))  # noqa: E731
-    assert found["step/a"] == pytest.approx(2 * alpha / ACTION * size(way).mean() / size(THETA), rel=1e-5)
+    assert found["step/policy.a"] == pytest.approx(2 * alpha / ACTION * size(way).mean() / size(THETA), rel=1e-5)
+    assert [name for name in found if name.startswith("step/")] == ["step/policy.a"]
     asked = np.asarray(batch.query.action)
     before = np.mean((THETA - asked) ** 2 / asked.reshape(-1, ACTION).var(axis=0))
     assert found["no_demo"] == pytest.approx(before, rel=1e-5)
