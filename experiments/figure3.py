@@ -19,6 +19,8 @@ import options
 import table
 from absl import app, flags
 
+from milx.results import intervals
+
 TITLES = {
     "reach": "vision, held-out colours",
     "reach_state": "state, held-out scenes",
@@ -65,12 +67,10 @@ def points(results: list[dict[str, Any]]) -> dict[tuple[str, str], dict[int, Poi
         groups[result["env"], result["method"], result["num_demos_train"]].append(result)
     curves: dict[tuple[str, str], dict[int, Point]] = collections.defaultdict(dict)
     for (env, method, size), runs in sorted(groups.items()):
-        curves[env, method][size] = Point(
-            statistics.mean(run["success"] for run in runs),
-            min(run["wilson95"][0] for run in runs),
-            max(run["wilson95"][1] for run in runs),
-            len(runs),
-        )
+        ends = intervals(runs)
+        mean = statistics.mean(run["success"] for run in runs)
+        low, high = min(end[0] for end in ends), max(end[1] for end in ends)
+        curves[env, method][size] = Point(mean, low, high, len(runs))
     return curves
 
 

@@ -72,7 +72,7 @@ def draw(rows: dict[str, Row], found: dict[str, dict[str, Any]], path: str) -> N
     for number, (name, row) in enumerate(rows.items()):
         with_curve = [run for run in _runs(name, row.shots[0], found) if "curve" in run]
         for i, run in enumerate(with_curve):
-            style = {"color": colors[number % len(colors)], "lw": 1.2, "label": None if i else row.label}
+            style = {"color": colors[number % len(colors)], "lw": 1.2, "label": None if i else row.label.replace("`", "")}
             steps = [line["step"] for line in run["curve"]]
             left.plot(steps, [100 * line["validation_success"] for line in run["curve"]], **style)
             right.plot(steps, [line["other_demo"] / line["own_demo"] for line in run["curve"]], **style)

@@ -54,12 +54,17 @@ RELEASED = {
 """What turns reach's `paper` back into the numbers of the released code."""
 _RAW = {name: value for name, value in RELEASED.items() if name.startswith("mil.")}
 _AT_ONCE = {"env.action_cost": 1.0}
+_NO_IMITATION = {"train.imitation_steps": 0}
 _SHORT = {"train.steps": 5000, "train.eval_every": 1000}
 _PLATEAU = {
     "released": ("the released numbers", RELEASED),
     "whitened": ("+ whitened actions", _without(RELEASED, "mil.")),
+    "one-rate": (
+        "+ whitened actions, the inner rate of the layers before the last",
+        _without(RELEASED, "mil.") | {"mil.inner_lr": 1.6e-3},
+    ),
     "lecun": ("+ LeCun's start", _without(RELEASED, "mil.", "network.")),
-    "schedule": ("+ clip, warm-up, cosine", {"train.imitation_steps": 0}),
+    "schedule": ("+ clip, warm-up, cosine", _NO_IMITATION),
     "imitation": ("+ imitation first: `paper`", {}),
     "raw": ("`paper` without whitened actions", _RAW),
     "small-start": ("`paper`, weights from N(0, 0.01)", {"network.fc_init_std": 0.01}),
@@ -69,7 +74,7 @@ _PLATEAU = {
         {"train.support_frames": 3, "train.query_frames": 3, "train.meta_batch": 64},
     ),
     "at-once": ("`paper`, an expert that moves at once", _AT_ONCE),
-    "at-once-schedule": ("the same without imitation first", _AT_ONCE | {"train.imitation_steps": 0}),
+    "at-once-schedule": ("the same without imitation first", _AT_ONCE | _NO_IMITATION),
     "at-once-whitened": ("+ whitened actions alone, that expert", _AT_ONCE | _without(RELEASED, "mil.")),
     "at-once-released": ("the released numbers, that expert", _AT_ONCE | RELEASED),
 }
@@ -122,12 +127,14 @@ _STEPS = {
         ),
         ("goal-head", "goal head", _GOAL_HEAD),
         ("calibrated", "votes from the camera's calibration", {"network.calibrate": True}),
+        ("fast", "36,000 updates, none without an inner step: `fast`", {"train.steps": 36_000} | _NO_IMITATION),
     ),
     "push": (
+        ("one-head", "one head", {"network.heads": 1}),
         (
             "sampled",
             "4 and 8 time steps of 32 tasks",
-            {"network.heads": 1, "train.support_frames": 4, "train.query_frames": 8, "train.meta_batch": 32},
+            {"train.support_frames": 4, "train.query_frames": 8, "train.meta_batch": 32},
         ),
         ("redrawn", "looks redrawn", {"train.redraw": True}),
         ("rates", "learned inner rates", {"mil.learn_inner_lr": True}),
@@ -143,6 +150,11 @@ _STEPS = {
         ),
         ("goal-head", "goal head", _GOAL_HEAD),
         ("calibrated", "votes from the camera's calibration", {"network.calibrate": True}),
+        (
+            "fast",
+            "30,000 updates, none without an inner step, clip 20: `fast`",
+            {"train.steps": 30_000, "mil.inner_clip": 20.0} | _NO_IMITATION,
+        ),
     ),
 }
 

@@ -9,6 +9,7 @@ from absl import flags
 
 from milx import config as config_lib
 from milx.config import Config
+from milx.results import intervals
 
 flags.adopt_module_key_flags(options)
 _ROWS = flags.DEFINE_list("rows", None, "Which rows; default all.")
@@ -122,10 +123,7 @@ def judged(run: dict[str, Any], criterion: str) -> dict[str, Any]:
 
 
 def interval(runs: list[dict[str, Any]]) -> str:
-    """The mean over runs, from where to where their 95% intervals reach, and how many there are.
-
-    The intervals are over held-out things where the files have such ("bootstrap95"), else over trials.
-    """
-    ends = [run.get("bootstrap95", run["wilson95"]) for run in runs]
+    """The mean over runs, from where to where their 95% intervals reach, and how many there are."""
+    ends = intervals(runs)
     low, high = min(end[0] for end in ends), max(end[1] for end in ends)
     return f"{statistics.mean(run['success'] for run in runs):.1%} ({low:.1%} to {high:.1%}; {len(runs)})"

@@ -27,8 +27,8 @@ class EnvConfig:
 
     Attributes:
         image_shape: (H, W) of the policy's image in pixels.
-        action_cost: weight of the actions in the planner's cost: with a lower one the expert moves at once and fast,
-            and its first actions tell where it goes; None for the environment's own.
+        action_cost: weight of the actions among the residuals whose squares the planner sums: with a lower one the
+            expert moves at once and fast, and its first actions tell where it goes; None for the environment's own.
     """
 
     image_shape: tuple[int, int] = (64, 80)

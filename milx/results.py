@@ -37,6 +37,15 @@ def describe(
     }
 
 
+def intervals(runs: list[dict[str, Any]]) -> list[tuple[float, float]]:
+    """The 95% intervals of the success in result files, all of one kind.
+
+    They are over held-out things ("bootstrap95") if every file has them, else over trials ("wilson95").
+    """
+    kind = "bootstrap95" if all("bootstrap95" in run for run in runs) else "wilson95"
+    return [(run[kind][0], run[kind][1]) for run in runs]
+
+
 def write_json(path: pathlib.Path, values: dict[str, Any]) -> None:
     """Writes a file as a whole: a process that is killed leaves the old one or the new one."""
     partial = path.with_suffix(f".partial{os.getpid()}")

@@ -1,5 +1,6 @@
 """What figures and tables make of result files."""
 
+import dataclasses
 import pathlib
 import sys
 
@@ -19,6 +20,7 @@ import tables
 
 from milx import envs, methods, training
 from milx.policy import spec_of
+from milx.presets import make_config
 
 
 def result(size, success, low, high, method="mil"):
@@ -108,6 +110,19 @@ def test_rows_of_the_published_method_fit_together_and_have_no_addition_unless_t
     training.check_steps(config)
     additions = config.network.goal_head, config.train.redraw, config.mil.learn_inner_lr
     assert not any(additions) or row in paper_rows.TABLES["ladder"].values()
+
+
+@pytest.mark.parametrize("env", ["reach", "push"])
+def test_the_ladder_ends_with_fast(env):
+    last = [row for name, row in paper_rows.TABLES["ladder"].items() if row.env == env][-1]
+    config = dataclasses.replace(paper_rows.configure(last, 1, seed=0), preset="fast")
+    assert config == make_config(env, preset="fast", seed=0)
+
+
+def test_intervals_of_one_table_are_of_one_kind():
+    over_things = result(500, 0.8, 0.7, 0.85) | {"bootstrap95": [0.6, 0.9]}
+    assert tables.interval([over_things, over_things]) == "80.0% (60.0% to 90.0%; 2)"
+    assert tables.interval([over_things, result(500, 0.6, 0.5, 0.7)]) == "70.0% (50.0% to 85.0%; 2)"
 
 
 def test_results_of_the_published_method_are_of_their_rows_and_in_the_docs():
