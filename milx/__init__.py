@@ -1,14 +1,25 @@
-"""milx: one-shot visual imitation by meta-learning, end to end on the accelerator."""
+"""milx: one-shot visual imitation by meta-learning, end to end on the accelerator.
 
-from milx import platform as _platform
+Importing it changes nothing in the process; launchers call `configure` first, and so should scripts of your own.
+"""
 
-_platform.configure()
-_platform.import_mjx()
+import importlib
+import importlib.metadata
+from types import ModuleType
 
-from milx.envs import ENVS, make  # noqa: E402
-from milx.methods import METHODS  # noqa: E402
-from milx.policy import Policy  # noqa: E402
-from milx.pretrained import load  # noqa: E402
-from milx.types import Demo, Observation  # noqa: E402
+from milx.core.platform import configure
+from milx.deploy.policy import Policy
+from milx.deploy.pretrained import load
+from milx.envs import ENVS, make
+from milx.methods import METHODS
+from milx.types import Demo, Observation
 
-__all__ = ["ENVS", "METHODS", "Demo", "Observation", "Policy", "load", "make"]
+__version__ = importlib.metadata.version("milx")
+__all__ = ["ENVS", "METHODS", "Demo", "Observation", "Policy", "__version__", "configure", "load", "make"]
+
+
+def __getattr__(name: str) -> ModuleType:
+    """`milx.gym`, which needs Gymnasium, is imported when it is first used."""
+    if name == "gym":
+        return importlib.import_module("milx.gym")
+    raise AttributeError(f"module 'milx' has no attribute {name!r}")

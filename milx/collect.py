@@ -2,21 +2,25 @@
 
     python -m milx.collect --env=reach --workdir=demos --config.data.tasks=100
 
-A file holds states, actions and tasks; `milx.pytrees.load` reads it.
+A file holds states, actions and tasks; `milx.core.pytrees.load` reads it.
 """
 
 import pathlib
 
-from milx import envs, launch, pytrees, validate
-from milx.config import Config
-from milx.simulation import split_demos
+from milx import envs
+from milx.config.check import check_config
+from milx.config.schema import Config
+from milx.core import pytrees
+from milx.training import command_line
+from milx.training.simulated import split_demos
+from milx.types import SPLITS
 
 
 def main(config: Config, workdir: str) -> None:
     """Writes train.npz, validation.npz and test.npz."""
-    validate.check(config)
+    check_config(config)
     env = envs.make(config.env_name, config.env.image_shape, config.env.action_cost)
-    for split in envs.SPLITS:
+    for split in SPLITS:
         demos = split_demos(env, config, split)
         path = pathlib.Path(workdir) / f"{split}.npz"
         pytrees.save(path, demos)
@@ -24,5 +28,5 @@ def main(config: Config, workdir: str) -> None:
 
 
 if __name__ == "__main__":
-    launch.define_flags()
-    launch.run(main)
+    command_line.define_flags()
+    command_line.run(main)

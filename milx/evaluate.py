@@ -10,8 +10,9 @@ import sys
 
 from absl import app, flags, logging
 
-from milx import config as config_lib
-from milx import runs
+from milx.config import schema
+from milx.core import platform
+from milx.training.factory import make_run
 
 _WORKDIR = flags.DEFINE_string("workdir", None, "Folder of the run.", required=True)
 
@@ -21,11 +22,12 @@ def main(argv: list[str]) -> None:
     if len(argv) > 1:
         raise app.UsageError(f"unexpected argument {argv[1]!r}")
     logging.set_verbosity(logging.WARNING)
+    platform.configure()
     path = pathlib.Path(_WORKDIR.value) / "config.json"
     if not path.is_file():
         sys.exit(f"milx: workdir: {path.parent} has no config.json, expected a folder of `python -m milx.train`")
     try:
-        run = runs.make(config_lib.read(path), path.parent)
+        run = make_run(schema.read(path), path.parent)
         run.report(run.evaluate())
     except (ValueError, OSError) as error:
         sys.exit(f"milx: {error}")

@@ -1,119 +1,16 @@
-"""Writes a run's best policy as two programs that run with JAX alone, on CPU and CUDA.
+"""Writes a run's best policy as two programs that run with JAX alone, on CPU and CUDA (`milx.deploy.export`).
 
 python -m milx.export runs/reach-mil-fast-0 exported
-
-adapt.bin, act.bin      the programs (jax.export), with nothing of milx, Flax or MuJoCo in them
-params.npz              what was learnt, whitening included, and the memory at the start of an episode
-policy.json             the shapes that the programs want
-policy.py               loads all that: `milx/exported.py`
 """
 
-import json
 import pathlib
-import shutil
 import sys
-from typing import Any
 
-import jax
-import jax.numpy as jnp
-import numpy as np
 from absl import app, flags, logging
-from jax import export as jax_export
 
-from milx import envs, exported
-from milx.config import GIVEN
-from milx.methods import Spec
-from milx.policy import Policy, with_goals
-from milx.pretrained import load
-from milx.types import Demo, Observation, Params
-
-PLATFORMS = ("cpu", "cuda")
-
-
-def export(policy: Policy, out: str | pathlib.Path, shots: int = 1) -> None:
-    """Writes a policy's programs and parameters.
-
-    Args:
-        policy: from `milx.load`.
-        out: the folder; must not exist.
-        shots: K, how many demonstrations `adapt` takes.
-
-    Raises:
-        ValueError: if the folder exists.
-    """
-    folder = pathlib.Path(out)
-    if folder.exists():
-        raise ValueError(f"out: {folder} exists, expected a folder that does not")
-    sizes = input_shapes(policy, shots)
-    leaves, structure = jax.tree.flatten(policy.params)
-
-    def learn(params: Params, demo: dict[str, jax.Array]) -> Params:
-        return policy.method.adapt(params, with_goals(Demo(**_with_state(demo, policy.spec)), policy.spec))
-
-    def adapt(leaves: list[jax.Array], demo: dict[str, jax.Array]) -> list[jax.Array]:
-        return jax.tree.leaves(learn(jax.tree.unflatten(structure, leaves), demo))
-
-    shapes = {
-        name: {field: jax.ShapeDtypeStruct(tuple(shape), _dtype(field)) for field, shape in fields.items()}
-        for name, fields in sizes.items()
-    }
-    task_params = jax.eval_shape(learn, policy.params, shapes["adapt"])
-    task_structure = jax.tree.structure(task_params)
-    memory, memory_structure = jax.tree.flatten(policy.initial_memory)
-
-    def seen(observation: dict[str, jax.Array]) -> Observation:
-        return Observation(**_with_state(observation, policy.spec))
-
-    def act(
-        leaves: list[jax.Array], observation: dict[str, jax.Array], memory: list[jax.Array]
-    ) -> tuple[jax.Array, list[jax.Array]]:
-        task_params = jax.tree.unflatten(task_structure, leaves)
-        remembered = jax.tree.unflatten(memory_structure, memory)
-        action, remembered = policy.method.act(task_params, seen(observation), remembered)
-        return action, jax.tree.leaves(remembered)
-
-    programs = {
-        "adapt": _program(adapt, leaves, shapes["adapt"]),
-        "act": _program(act, jax.tree.leaves(task_params), shapes["act"], memory),
-    }
-    partial = folder.with_name(f"{folder.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir(parents=True)
-    for name, program in programs.items():
-        (partial / f"{name}.bin").write_bytes(program)
-    arrays: dict[str, Any] = {f"{i:04d}": np.asarray(leaf) for i, leaf in enumerate(leaves)}
-    arrays |= {f"memory{i:04d}": np.asarray(leaf) for i, leaf in enumerate(memory)}
-    np.savez(partial / "params.npz", **arrays)
-    (partial / "policy.json").write_text(json.dumps(sizes, indent=1) + "\n")
-    shutil.copyfile(exported.__file__, partial / "policy.py")
-    partial.rename(folder)
-
-
-def input_shapes(policy: Policy, shots: int) -> dict[str, dict[str, list[int]]]:
-    """Shapes of the fields that "adapt" and "act" take."""
-    spec, config = policy.spec, policy.config
-    horizon = config.recorded.horizon if config.recorded.path else envs.ENVS[config.env_name].horizon
-    seen = {"state": [spec.state_size]} if spec.state_size else {}
-    if spec.image_shape is not None:
-        seen["image"] = [*spec.image_shape, 3]
-    shown = seen | {"action": [spec.action_size]}
-    hidden = {GIVEN[0]: (), GIVEN[1]: ("action",), GIVEN[2]: ("action", "state")}[config.mil.given]
-    adapt = {name: [shots, horizon, *shape] for name, shape in shown.items() if name not in hidden}
-    return {"adapt": adapt, "act": seen}
-
-
-def _with_state(fields: dict[str, jax.Array], spec: Spec) -> dict[str, jax.Array]:
-    """What is shown, with an empty state where there are no states."""
-    return fields if spec.state_size else {**fields, "state": jnp.zeros((*fields["image"].shape[:-3], 0))}
-
-
-def _dtype(field: str) -> Any:
-    return np.uint8 if field == "image" else np.float32
-
-
-def _program(function: Any, *args: Any) -> bytes:
-    shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), args)
-    return bytes(jax_export.export(jax.jit(function), platforms=PLATFORMS)(*shapes).serialize())
+from milx.core import platform
+from milx.deploy.export import export
+from milx.deploy.pretrained import load
 
 
 def main(argv: list[str]) -> None:
@@ -121,6 +18,7 @@ def main(argv: list[str]) -> None:
     if len(argv) != 3:
         raise app.UsageError("expected two arguments, RUN and OUT")
     logging.set_verbosity(logging.WARNING)
+    platform.configure()
     try:
         export(load(argv[1]), argv[2], flags.FLAGS.shots)
     except (ValueError, OSError) as error:

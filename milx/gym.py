@@ -17,13 +17,13 @@ import numpy as np
 from gymnasium import spaces
 
 from milx import envs
-from milx.config import DataConfig
-from milx.data.demos import render_demo
+from milx.config.presets import make_config
+from milx.config.schema import DataConfig
+from milx.data.simulated import render_demo
 from milx.envs.base import State
-from milx.presets import make_config
 from milx.trajopt.expert import perform
 from milx.trajopt.ilqr import Options
-from milx.types import Demo
+from milx.types import SPLITS, Demo
 
 
 class GymEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
@@ -52,8 +52,8 @@ class GymEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         image_shape: tuple[int, int] | None = None,
         render_mode: str | None = None,
     ):
-        if split not in envs.SPLITS:
-            raise ValueError(f"split: got {split!r}, expected one of {', '.join(envs.SPLITS)}")
+        if split not in SPLITS:
+            raise ValueError(f"split: got {split!r}, expected one of {', '.join(SPLITS)}")
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode: got {render_mode!r}, expected None or 'rgb_array'")
         self.env, self.split, self.render_mode = envs.make(name, image_shape), split, render_mode

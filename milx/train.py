@@ -6,17 +6,18 @@ Run it again with the same flags and it continues where it stopped.
     python -m milx.train --env=reach --preset=paper --seed=1 --config.train.meta_batch=25
 """
 
-from milx import launch, runs
-from milx.config import Config
+from milx.config.schema import Config
+from milx.training import command_line
+from milx.training.factory import make_run
 
 
 def main(config: Config, workdir: str) -> None:
     """Trains and evaluates."""
-    run = runs.make(config, workdir)
+    run = make_run(config, workdir)
     run.train()
     run.report(run.evaluate())
 
 
 if __name__ == "__main__":
-    launch.define_flags()
-    launch.run(main)
+    command_line.define_flags()
+    command_line.run(main)

@@ -11,10 +11,12 @@ import pytest
 from tiny import QUIET, tiny_config
 from xdist.scheduler import LoadScopeScheduling
 
-from milx.config import Config
-from milx.data.demos import DemoSet
-from milx.simulation import SimulatedRun
+import milx
+from milx.config.schema import Config
+from milx.data.simulated import DemoSet
+from milx.training.simulated import SimulatedRun
 
+milx.configure()
 # Compiling takes longer than running here.
 os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=1"
 
@@ -44,7 +46,7 @@ class Trained:
 
 FIRST = (
     *("test_run.py", "test_parallel.py", "test_notebook.py"),
-    *("test_cells.py", "test_demos.py", "test_evaluator.py", "test_policy.py"),
+    *("test_cells.py", "test_simulated.py", "test_closed_loop.py", "test_policy.py"),
 )
 """The files that take longest, so that in the end no process is left alone with one of them."""
 

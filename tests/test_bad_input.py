@@ -19,17 +19,17 @@ from absl import flags
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from milx import config as config_lib
-from milx import launch, recording, validate
-from milx.config import GIVEN
+from milx.config import schema
+from milx.config.check import check_config
+from milx.config.presets import PRESETS, make_config
+from milx.config.schema import GIVEN
 from milx.data import lerobot
 from milx.data.dataset import DataSet, Writer
 from milx.data.lerobot import LeRobot
 from milx.data.robomimic import Robomimic
-from milx.methods import Spec
-from milx.policy import check_demo, check_observation
-from milx.presets import PRESETS, make_config
-from milx.types import Demo, Observation
+from milx.deploy.policy import check_demo, check_observation
+from milx.training import command_line, recorded
+from milx.types import Demo, Observation, Spec
 
 CASES = {
     "demos": 700,
@@ -135,17 +135,17 @@ JSON = st.recursive(
 def test_configs(data):
     """A field of a preset with any value: what is accepted comes back, and is a number where it must be one."""
     env = data.draw(st.sampled_from(sorted(PRESETS)))
-    values = config_lib.to_dict(make_config(env, preset="cpu"))
-    name = data.draw(st.sampled_from([*config_lib.flatten(values), "train", "nope"]))
+    values = schema.to_dict(make_config(env, preset="cpu"))
+    name = data.draw(st.sampled_from([*schema.flatten(values), "train", "nope"]))
     *path, last = name.split(".")
     group = values
     for part in path:
         group = group[part]
     group[last] = data.draw(st.one_of(JSON, st.just([3, 3]), st.just([0]), st.integers(1, 5)))
-    config = accepted(lambda: config_lib.from_dict(values))
+    config = accepted(lambda: schema.from_dict(values))
     if config is not None:
-        assert config_lib.from_dict(json.loads(json.dumps(config_lib.to_dict(config)))) == config
-        for field, value in config_lib.flatten(config_lib.to_dict(config)).items():
+        assert schema.from_dict(json.loads(json.dumps(schema.to_dict(config)))) == config
+        for field, value in schema.flatten(schema.to_dict(config)).items():
             if isinstance(value, float):
                 assert np.isfinite(value), field
 
@@ -154,7 +154,7 @@ def test_configs(data):
 @given(data=st.data())
 def test_flags(data):
     """Flags and overrides with any text: a configuration that training would take, or an error that names the flag."""
-    fields = config_lib.flatten(config_lib.to_dict(make_config("reach", preset="cpu")))
+    fields = schema.flatten(schema.to_dict(make_config("reach", preset="cpu")))
     names = ["env", "method", "preset", "seed", "data", "nope", *(f"config.{name}" for name in (*fields, "nope"))]
     literal = JSON.map(repr)
     text = st.one_of(
@@ -164,14 +164,14 @@ def test_flags(data):
 
     def parse():
         values = flags.FlagValues()
-        launch.define_flags(values)
-        launch.parse(["train", "--preset=cpu", *(f"--{name}={value}" for name, value in drawn)], values)
-        validate.check(values.config)
+        command_line.define_flags(values)
+        command_line.parse(["train", "--preset=cpu", *(f"--{name}={value}" for name, value in drawn)], values)
+        check_config(values.config)
         return values.config
 
     config = accepted(parse)
     if config is not None:
-        assert config_lib.from_dict(config_lib.to_dict(config)) == config
+        assert schema.from_dict(schema.to_dict(config)) == config
 
 
 @pytest.fixture(scope="module")
@@ -211,7 +211,7 @@ def test_headers_of_data_sets(data_set, data):
 
     def read():
         opened = DataSet(folder)
-        recording.make_config(folder, preset="cpu")
+        recorded.make_config(folder, preset="cpu")
         return [opened.read(i, j) for i, task in enumerate(opened.header.tasks) for j in range(len(task.lengths))]
 
     demos = accepted(read)

@@ -7,8 +7,8 @@ import re
 import pytest
 
 from milx import envs
+from milx.config.presets import PRESETS
 from milx.methods import METHODS
-from milx.presets import PRESETS
 
 DOCS = pathlib.Path(__file__).parents[1] / "docs"
 

@@ -23,7 +23,7 @@ def random_demos(env, num_tasks, num_demos):
     """Wanderings, where nobody planned anything: rendering and learning ask for no more."""
     import jax
 
-    from milx.data import demos as demos_lib
+    from milx.data import simulated as demos_lib
 
     rng = np.random.default_rng(0)
     like = demos_lib.shapes(env, num_tasks, num_demos)
@@ -38,13 +38,14 @@ def measure(num_devices, everything):
     from jax.sharding import Mesh
     from tiny import tiny_config
 
-    from milx import envs, evaluator, methods, parallel
-    from milx.data.demos import sampler
-    from milx.policy import spec_of
-    from milx.trainer import Trainer, make_optimizer
+    from milx import envs, methods
+    from milx.core import parallel
+    from milx.data.simulated import sampler
+    from milx.evaluation import closed_loop
+    from milx.methods.whitening import Whitening
+    from milx.training.update import Trainer, make_optimizer
     from milx.trajopt.expert import perform
     from milx.trajopt.ilqr import Options
-    from milx.whitening import Whitening
 
     parallel.mesh = lambda: Mesh(jax.devices()[:num_devices], (parallel.AXIS,))
     config = tiny_config(env="reach_state")
@@ -55,7 +56,7 @@ def measure(num_devices, everything):
         env = envs.make("reach_state")
         trainer = Trainer(
             sampler(env, config.train),
-            methods.make(config, spec_of(env)),
+            methods.make(config, env.spec),
             config.train,
             make_optimizer(config.optimizer, STEPS),
         )
@@ -74,7 +75,7 @@ def measure(num_devices, everything):
     if everything:
         env, trainer, demos, state = build(np.float32)
         config.evaluation.batch = config.evaluation.trials = 3
-        trials = evaluator.run_trials(env, trainer.method, state.params, demos, config.evaluation, key)
+        trials = closed_loop.run_trials(env, trainer.method, state.params, demos, config.evaluation, key)
         found["trials"] = np.asarray(trials.states.qpos).tolist()
         start = jax.tree.map(lambda x: x[:4, 0, 0], demos.states)
         task = jax.tree.map(lambda x: x[:4], demos.task)
@@ -99,12 +100,12 @@ def run(data, folder):
     """Trains and validates on recorded demonstrations, on all devices that there are."""
     from tiny import QUIET
 
-    from milx import recording
+    from milx.training import recorded
 
-    config = recording.make_config(data, preset="cpu")
+    config = recorded.make_config(data, preset="cpu")
     config.recorded.horizon, config.network.fc_layers = 9, (32,)
     config.train.steps, config.train.log_every, config.train.eval_every = 40, 10, 20
-    run = recording.RecordedRun(config, folder, QUIET)
+    run = recorded.RecordedRun(config, folder, QUIET)
     run.train()
     return {
         "metrics": [json.loads(line) for line in (run.folder / "metrics.jsonl").open()],
@@ -124,12 +125,15 @@ def params_of(folder):
 
 def work(arguments):
     """Runs in a process of its own: `devices 1,4 FOLDER`, `alone DATA FOLDER`, or `host ID ADDRESS DATA FOLDER`."""
+    import milx
+
+    milx.configure()
     if arguments[0] == "devices":
         found = {n: measure(int(n), everything=True) for n in arguments[1].split(",")}
         return found | {"restored": params_of(arguments[2])}
     if arguments[0] == "alone":
         return run(*arguments[1:])
-    from milx import parallel
+    from milx.core import parallel
 
     parallel.join_hosts(arguments[2], 2, int(arguments[1]))
     return run(*arguments[3:]) | measure(2, False)

@@ -2,8 +2,8 @@
 
 from rich.console import Console
 
-from milx.config import Config
-from milx.presets import make_config
+from milx.config.presets import make_config
+from milx.config.schema import Config
 
 QUIET = Console(quiet=True)
 

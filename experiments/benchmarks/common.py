@@ -10,7 +10,7 @@ from typing import Any
 
 import jax
 
-from milx import provenance
+from milx.evaluation import provenance
 
 RESULTS = pathlib.Path(__file__).parents[1] / "results" / "benchmarks"
 ACCELERATED = jax.default_backend() != "cpu"

@@ -22,13 +22,14 @@ import pyarrow
 import pyarrow.parquet
 from absl import app, flags
 
+import milx
 from milx import envs, methods
+from milx.config.presets import make_config
 from milx.data import episodes
 from milx.data.lerobot import LeRobot
+from milx.deploy.policy import Policy
 from milx.export import export
-from milx.policy import Policy, spec_of
-from milx.presets import make_config
-from milx.whitening import Whitening
+from milx.methods.whitening import Whitening
 
 _OUT = flags.DEFINE_string("out", "experiments/results/benchmarks", "Folder of the JSON file.")
 TASKS, EPISODES, FRAMES, SIZE, FPS = 50, 4, 100, 128, 30
@@ -122,7 +123,7 @@ def measure_import(folder: pathlib.Path, report: common.Report) -> None:
 def measure_export(preset: str, folder: pathlib.Path, report: common.Report) -> None:
     """Rows of an exported push policy, in a process of its own."""
     config, env = make_config("push", preset=preset), envs.make("push")
-    spec = spec_of(env)
+    spec = env.spec
     sizes = [spec.state_size] * 2 + [spec.action_size] * 2
     whitening = Whitening(*(jnp.full(n, i % 2, jnp.float32) for i, n in enumerate(sizes)))
     method = methods.make(config, spec)
@@ -143,6 +144,7 @@ def measure_export(preset: str, folder: pathlib.Path, report: common.Report) -> 
 
 def main(_: list[str]) -> None:
     """Measures and writes the JSON file."""
+    milx.configure()
     report = common.Report("deploy", pathlib.Path(_OUT.value))
     with tempfile.TemporaryDirectory() as folder:
         measure_import(pathlib.Path(folder), report)

@@ -12,8 +12,9 @@ import common
 import workload
 from absl import app, flags
 
+import milx
 from milx import envs
-from milx.presets import make_config
+from milx.config.presets import make_config
 
 _OUT = flags.DEFINE_string("out", str(common.RESULTS), "Folder of the JSON file.")
 _TINY = flags.DEFINE_bool("tiny", False, "One size of each, for a try.")
@@ -27,6 +28,7 @@ _SIZES = {
 
 def main(_: list[str]) -> None:
     """Measures and writes the JSON file."""
+    milx.configure()
     report = common.Report("growth", pathlib.Path(_OUT.value))
     changes = [(name, size) for name, sizes in _SIZES.items() for size in sizes[: 1 if _TINY.value else None]]
     for name, size in [("meta-batch", 5), *changes]:

@@ -16,13 +16,16 @@ import workload
 from absl import app, flags
 from jax.experimental.compilation_cache import compilation_cache
 
-from milx import envs, evaluator, methods, platform
-from milx.config import Config
-from milx.data.demos import sampler
+import milx
+from milx import envs, methods
+from milx.config.presets import make_config
+from milx.config.schema import Config
+from milx.core import platform
+from milx.data.simulated import sampler
+from milx.deploy.policy import Policy
 from milx.envs.base import Env
-from milx.policy import Policy, spec_of
-from milx.presets import make_config
-from milx.trainer import Trainer, make_optimizer
+from milx.evaluation import closed_loop
+from milx.training.update import Trainer, make_optimizer
 from milx.trajopt.expert import perform
 from milx.trajopt.ilqr import Options
 from milx.types import Observation
@@ -34,7 +37,7 @@ _PLANS = flags.DEFINE_integer("plans", None, "Demonstrations planned at once; 4,
 
 def measure_policy(name: str, config: Config, env: Env, report: common.Report) -> None:
     """Rows of one policy's adaptation to one demonstration, and of one action."""
-    spec = spec_of(env)
+    spec = env.spec
     method = methods.make(config, spec)
     policy = Policy(method, spec, method.init(jax.random.key(0), workload.unit_whitening(env)), config)
     demo = jax.tree.map(lambda x: x[0, 0], workload.random_batch(env, 1, env.horizon).support)
@@ -46,12 +49,12 @@ def measure_policy(name: str, config: Config, env: Env, report: common.Report) -
 
 def measure_evaluation(config: Config, env: Env, report: common.Report) -> None:
     """Row of the closed-loop evaluation: adapting included, demonstrations given."""
-    method = methods.make(config, spec_of(env))
+    method = methods.make(config, env.spec)
     params = method.init(jax.random.key(0), workload.unit_whitening(env))
     demos = workload.random_demos(env, _TASKS.value, 1)
     config.evaluation.batch = _TASKS.value
     milliseconds = common.median_ms(
-        lambda: evaluator.run_trials(env, method, params, demos, config.evaluation, jax.random.key(0)), repeats=5
+        lambda: closed_loop.run_trials(env, method, params, demos, config.evaluation, jax.random.key(0)), repeats=5
     )
     trials = _TASKS.value * config.evaluation.trials
     report.add(f"{trials:,} closed-loop trials of {env.horizon} steps", 1e-3 * milliseconds, "s")
@@ -71,7 +74,7 @@ def measure_compilation(config: Config, env: Env, report: common.Report) -> None
     """Rows of compiling the training scan: without a cache, and from it."""
     trainer = Trainer(
         sampler(env, config.train),
-        methods.make(config, spec_of(env)),
+        methods.make(config, env.spec),
         config.train,
         make_optimizer(config.optimizer, 100),
     )
@@ -88,6 +91,7 @@ def measure_compilation(config: Config, env: Env, report: common.Report) -> None
 
 def main(_: list[str]) -> None:
     """Measures and writes the JSON file."""
+    milx.configure()
     report, env = common.Report("latency", pathlib.Path(_OUT.value)), envs.make("reach")
     fast = make_config("reach", preset="fast")
     measure_policy("reach, paper's network", make_config("reach", preset="paper"), env, report)

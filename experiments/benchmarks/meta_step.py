@@ -23,13 +23,14 @@ import push_sized
 import workload
 from absl import app, flags
 
-from milx import envs, methods, platform
-from milx.config import Config
+import milx
+from milx import envs, methods
+from milx.config.presets import make_config
+from milx.config.schema import Config
+from milx.core import platform
 from milx.envs.base import Env
 from milx.networks import layers
-from milx.policy import spec_of
-from milx.presets import make_config
-from milx.trainer import Loss, meta_gradient
+from milx.training.update import Loss, meta_gradient
 from milx.types import Params, TaskBatch
 
 _OUT = flags.DEFINE_string("out", str(common.RESULTS), "Folder of the JSON file.")
@@ -51,7 +52,7 @@ def compile_gradient(
     config: Config, env: Env, batch: TaskBatch, gradient: Callable[..., Any] = meta_gradient
 ) -> tuple[jax.stages.Compiled, Any]:
     """The meta-gradient, compiled, and parameters for it."""
-    method = methods.make(config, spec_of(env))
+    method = methods.make(config, env.spec)
     params = method.init(jax.random.key(0), workload.unit_whitening(env))
     jitted = jax.jit(functools.partial(gradient, method.loss))
     return jitted.lower(params, batch).compile(platform.pixel_options()), params
@@ -173,6 +174,7 @@ def measure_domain(name: str) -> None:
 
 def main(_: list[str]) -> None:
     """Measures and writes the JSON files."""
+    milx.configure()
     for name in _DOMAINS.value:
         measure_domain(name)
 

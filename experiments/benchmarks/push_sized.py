@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import mujoco
 from mujoco import mjx
 
-from milx.config import Config, DataConfig, EnvConfig, MILConfig, NetworkConfig, TrainConfig
+from milx.config.schema import Config, DataConfig, EnvConfig, MILConfig, NetworkConfig, TrainConfig
 from milx.envs.base import Env, State
 
 _JOINTS = ("0 0 1", "0 1 0", "0 0 1", "0 1 0", "1 0 0", "0 1 0", "1 0 0")

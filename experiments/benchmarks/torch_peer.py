@@ -1,6 +1,6 @@
 """The same meta-step in PyTorch: what a user of learn2learn, higher or torch.func would run.
 
-Network, losses and update are those of `milx.methods.maml` with a fixed inner rate, images come as uint8.
+Network, losses and update are those of `milx.methods.mil` with a fixed inner rate, images come as uint8.
 """
 
 from collections.abc import Callable
@@ -8,7 +8,7 @@ from collections.abc import Callable
 import torch
 from torch.nn import functional
 
-from milx.config import Config
+from milx.config.schema import Config
 
 
 def same(x: torch.Tensor, kernel: int, stride: int) -> torch.Tensor:

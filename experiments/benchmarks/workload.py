@@ -7,14 +7,14 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import NamedSharding, PartitionSpec
 
-from milx import methods, parallel, platform
-from milx.config import Config
-from milx.data.demos import DemoSet, sampler
+from milx import methods
+from milx.config.schema import Config
+from milx.core import parallel, platform
+from milx.data.simulated import DemoSet, sampler
 from milx.envs.base import Env, State
-from milx.policy import spec_of
-from milx.trainer import Trainer, make_optimizer
+from milx.methods.whitening import Whitening
+from milx.training.update import Trainer, make_optimizer
 from milx.types import Demo, TaskBatch
-from milx.whitening import Whitening
 
 
 def random_batch(env: Env, tasks: int, frames: int) -> TaskBatch:
@@ -52,7 +52,7 @@ def measure_step(config: Config, env: Env) -> tuple[float, float]:
     """Median ms of a training step, rendering included, in a scan on the devices of the mesh; and GiB on each."""
     trainer = Trainer(
         sampler(env, config.train),
-        methods.make(config, spec_of(env)),
+        methods.make(config, env.spec),
         config.train,
         make_optimizer(config.optimizer, 100),
     )

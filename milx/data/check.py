@@ -8,8 +8,8 @@ from rich.console import Console
 from rich.table import Table
 
 from milx.data.dataset import DataSet, check_size
-from milx.envs.base import SPLITS
-from milx.whitening import MIN_STD
+from milx.methods.whitening import MIN_STD
+from milx.types import SPLITS
 
 MANY_ROWS = 256
 """Images with more rows than this are slow to learn from."""

@@ -23,8 +23,7 @@ from typing import Any
 import numpy as np
 import tensorstore as ts
 
-from milx.envs.base import SPLITS
-from milx.types import Demo
+from milx.types import SPLITS, Demo
 
 VERSION = 1
 ALL_FIELDS = ("image", "state", "action")

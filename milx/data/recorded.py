@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from milx.data.dataset import DataSet, spread
-from milx.data.demos import frame_indices
-from milx.goals import goals
+from milx.data.goals import goals
+from milx.data.simulated import frame_indices
 from milx.types import Array, Demo, TaskBatch
 
 MOST_DEMOS = 16
@@ -89,7 +89,7 @@ def sample_batch(
         support_frames: time steps drawn from each support demonstration; None for all.
         query_frames: time steps drawn from the query demonstration; None for all.
         given_action: the support, too, must show actions.
-        goal_indices: entries of the state that tell where the robot is (`milx.goals`).
+        goal_indices: entries of the state that tell where the robot is (`milx.data.goals`).
     """
     support = recorded.acts if given_action else recorded.there
     enough = (recorded.acts.any(axis=1) & (support.sum(axis=1) > shots)).astype(jnp.float32)

@@ -1,13 +1,13 @@
 """Environments by name."""
 
-from milx.envs.base import SPLITS, Env, State, Task
-from milx.envs.place import Place
-from milx.envs.push import Push
+from milx.envs.base import Env, State, Task
+from milx.envs.place.env import Place
+from milx.envs.push.env import Push
 from milx.envs.reach import Reach, ReachState
 
 ENVS: dict[str, type[Env]] = {env.name: env for env in (Reach, ReachState, Push, Place)}
 
-__all__ = ["ENVS", "SPLITS", "Env", "State", "Task", "make"]
+__all__ = ["ENVS", "Env", "State", "Task", "make"]
 
 
 def make(name: str, image_shape: tuple[int, int] | None = None, action_cost: float | None = None) -> Env:

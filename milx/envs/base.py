@@ -14,14 +14,14 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from mujoco import mjx
 
+from milx.core import platform
+from milx.core.mjx import mjx
 from milx.render.scene import Renderer
 from milx.render.textures import Textures
-from milx.types import Observation
+from milx.types import SPLITS, Observation, Spec
 
 Task = Any
-SPLITS = ("train", "validation", "test")
 ASSETS = pathlib.Path(__file__).parent / "assets"
 
 
@@ -64,13 +64,15 @@ class Env(abc.ABC):
         image_shape: (H, W) of the published experiment.
         camera: the MJCF camera that the policy sees through.
         criterion: what counts as success, in words, for result files.
-        goal_indices: entries of the robot's state that tell where it is heading (`milx.goals`).
+        goal_indices: entries of the robot's state that tell where it is heading (`milx.data.goals`).
         height_index: the entry that tells how high its hand is, where it must come down to an object; None otherwise.
         vision: whether the policy sees the image; if not, the state tells it where the objects are.
         object_indices: [O][2] entries of the state with each object's place, where the state tells them.
         tactics: ways in which the controller may go about a scene, in the order of preference; what the numbers mean is
             the controller's affair.
         action_cost: weight of the action in the planner's running cost (no unit): the lower, the faster the expert.
+        version: raised when tasks, scenes, physics, costs or the controller change, so that no demonstration planned
+            before it is taken for one planned after it.
     """
 
     name: str
@@ -85,8 +87,10 @@ class Env(abc.ABC):
     object_indices: tuple[tuple[int, ...], ...] = ()
     tactics: tuple[float, ...] = (0.0,)
     action_cost: float = 1.0
+    version: int = 1
 
     def __init__(self, model: mujoco.MjModel, image_shape: tuple[int, int] | None = None):
+        platform.warn_if_not_configured()
         self.mj_model = model
         device = jax.local_devices()[0]  # MJX would take the first of all, which may be another host's
         self.model = mjx.put_model(model, device)
@@ -113,6 +117,16 @@ class Env(abc.ABC):
         """The lowest and highest action, [A] each; `step` clips to it."""
         low, high = self.mj_model.actuator_ctrlrange.T
         return jnp.asarray(low, float), jnp.asarray(high, float)
+
+    @property
+    def spec(self) -> Spec:
+        """The sizes of what a policy sees and does."""
+        low, high = (tuple(np.asarray(limit).tolist()) for limit in self.action_range)
+        calibration = self.image_to_goal
+        image_to_goal = None if calibration is None else tuple(tuple(row) for row in calibration.tolist())
+        image_shape = self.image_shape if self.vision else None
+        sizes = image_shape, self.state_size, self.action_size
+        return Spec(*sizes, (low, high), self.goal_indices, image_to_goal, self.object_indices, self.height_index)
 
     @property
     def image_to_goal(self) -> np.ndarray | None:

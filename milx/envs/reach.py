@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from mujoco import mjx
 
+from milx.core.mjx import mjx
 from milx.envs.base import ASSETS, Env, State, check_split
 
 NUM_OBJECTS = 3

@@ -1,58 +1,23 @@
 """Methods by name, built from a configuration and the sizes of what they see and do."""
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any
 
-from milx.config import GIVEN, VARIANTS, Config
+import jax
+import numpy as np
+
+from milx.config.schema import GIVEN, VARIANTS, Config
 from milx.methods.base import Method
-from milx.methods.context import ContextPolicy
-from milx.methods.maml import MIL
+from milx.methods.contextual import ContextPolicy
+from milx.methods.mil import MIL
+from milx.methods.whitening import Whitening
 from milx.networks.attention import AttentiveActor, ObjectTokens
-from milx.networks.context import Actor, LastFrame, Recurrent, make_context_network
+from milx.networks.encoders import Actor, LastFrame, Recurrent, make_context_network
 from milx.networks.learned_loss import KINDS
-from milx.networks.policy import make_policy
+from milx.networks.policy_network import make_policy
+from milx.types import Params, Spec
 
-__all__ = ["METHODS", "Method", "Spec", "make"]
-
-
-@dataclasses.dataclass(frozen=True)
-class Spec:
-    """The sizes of what a policy sees and does.
-
-    Attributes:
-        image_shape: (H, W); None where the policy sees no pixels.
-        state_size: S.
-        action_size: A.
-        action_range: lowest and highest entry of each action; None without limits.
-        goal_indices: entries of the state that tell where the robot is heading (`milx.goals`).
-        image_to_goal: [3][G] affine map from (x, y, 1), x and y in [-1, 1] across and down the image, to those entries,
-            from the camera's calibration; None if that is not known.
-        object_indices: [O][2] entries of the state with each object's place, where the state tells them.
-        height_index: entry of the state that tells how high the hand is, where it must come down to an object.
-    """
-
-    image_shape: tuple[int, int] | None
-    state_size: int
-    action_size: int
-    action_range: tuple[tuple[float, ...], tuple[float, ...]] | None
-    goal_indices: tuple[int, ...]
-    image_to_goal: tuple[tuple[float, ...], ...] | None = None
-    object_indices: tuple[tuple[int, ...], ...] = ()
-    height_index: int | None = None
-
-    def to_dict(self) -> dict[str, Any]:
-        """As JSON can hold it."""
-        return dataclasses.asdict(self)
-
-    @classmethod
-    def from_dict(cls, values: dict[str, Any]) -> "Spec":
-        """The inverse of `to_dict`, also after a trip through JSON."""
-        return cls(**{name: _as_tuple(value) for name, value in values.items()})
-
-
-def _as_tuple(value: Any) -> Any:
-    return tuple(_as_tuple(each) for each in value) if isinstance(value, list) else value
+__all__ = ["METHODS", "Method", "make", "params_like"]
 
 
 def _make_mil(config: Config, spec: Spec) -> Method:
@@ -113,6 +78,12 @@ def make(config: Config, spec: Spec) -> Method:
         expected = "None: this policy sees no pixels"
         raise ValueError(f"network.fixed_filters: got {config.network.fixed_filters!r}, expected {expected}")
     return METHODS[config.method_name](config, spec)
+
+
+def params_like(method: Method, spec: Spec) -> Params:
+    """Shapes and types of a method's parameters."""
+    state, action = (jax.ShapeDtypeStruct((size,), np.float32) for size in (spec.state_size, spec.action_size))
+    return jax.eval_shape(method.init, jax.random.key(0), Whitening(state, state, action, action))
 
 
 def _check_variant(config: Config) -> None:

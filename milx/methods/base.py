@@ -4,8 +4,8 @@ import abc
 
 import jax
 
+from milx.methods.whitening import Whitening
 from milx.types import Demo, Memory, Observation, Params, TaskBatch
-from milx.whitening import Whitening
 
 
 class Method(abc.ABC):

@@ -6,11 +6,11 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-from milx.config import GIVEN, MILConfig
+from milx.config.schema import GIVEN, MILConfig
+from milx.methods.whitening import Whitening
 from milx.networks.goal import Goal, calibrate
-from milx.networks.policy import PolicyOutput
+from milx.networks.policy_network import PolicyOutput
 from milx.types import Demo, Params
-from milx.whitening import Whitening
 
 
 def shown(demo: Demo, given: str, whitening: Whitening) -> Demo:

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 
 from milx.methods.base import Method
+from milx.methods.whitening import Whitening
 from milx.types import Demo, Memory, Observation, Params, TaskBatch
-from milx.whitening import Whitening
 
 
 @dataclasses.dataclass(frozen=True)

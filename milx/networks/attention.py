@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from milx.config import NetworkConfig
+from milx.config.schema import NetworkConfig
 from milx.networks.layers import Dense
-from milx.networks.policy import Controller, PolicyOutput
+from milx.networks.policy_network import Controller, PolicyOutput
 
 _HOPS = 2
 

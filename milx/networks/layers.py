@@ -216,7 +216,7 @@ class ConvBlock(nn.Module):
 
 
 class FixedConv(nn.Module):
-    """Convolution, bias, ReLU that no gradient reaches; zero until `milx.networks.fixed` puts filters in.
+    """Convolution, bias, ReLU that no gradient reaches; zero until `milx.networks.fixed_filters` puts filters in.
 
     Attributes:
         filters, kernel, stride, mixed_precision: as in `ConvBlock`.

@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from mujoco import mjx
 
+from milx.core.mjx import mjx
 from milx.render import kernel, raycast, shade, textures
 from milx.render.textures import Textures
 

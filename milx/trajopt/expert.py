@@ -13,9 +13,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from milx import parallel
+from milx.core import parallel
 from milx.envs.base import Env, State, Task
 from milx.trajopt.ilqr import Options, Plan, Problem, solve
+
+VERSION = 1
+"""Of all that plans and demonstrates: raised when it does so differently, so that no demonstration planned before it is
+taken for one planned after it."""
 
 
 def plan(env: Env, task: Task, state: State, options: Options) -> Plan:

@@ -32,6 +32,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from milx.core.linear_algebra import solve_free
 from milx.trajopt import boxqp
 from milx.trajopt.linearize import linearize
 
@@ -144,7 +145,7 @@ def _backward(problem: Problem, states: jax.Array, actions: jax.Array, mu: jax.A
         Q_uu = r_u.T @ r_u + B.T @ V_reg @ B
         Q_ux = r_u.T @ r_x + B.T @ V_reg @ A
         k, free = boxqp.solve(Q_uu, Q_u, problem.control_low - u, problem.control_high - u, start=k_next)
-        K = -boxqp.solve_free(Q_uu, Q_ux, free)
+        K = -solve_free(Q_uu, Q_ux, free)
         F, S = A + B @ K, r_x + r_u @ K
         Bk, r_uk = B @ k, r_u @ k
         # V_x is that of the full step. Its part at α = 0 makes the expected change exact for every α, whatever μ is.

@@ -8,13 +8,16 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+import planned
 import pytest
 
-from milx.envs import containers, drop, place
 from milx.envs.base import State
-from milx.envs.containers import CONTAINERS
-from milx.envs.place import NUM_JOINTS, Place
+from milx.envs.place import containers, drop
+from milx.envs.place import env as place
+from milx.envs.place.containers import CONTAINERS
+from milx.envs.place.env import NUM_JOINTS, Place
 from milx.envs.shapes import SHAPES
+from milx.trajopt.expert import VERSION
 
 FAR = jnp.array([10.0, 10.0, 0.0])
 
@@ -86,6 +89,22 @@ def test_an_episode_of_motion_is_that_of_mujoco_with_numpy(env, task):
             at_limit |= bool((qpos != free).any())
         np.testing.assert_allclose(found.qpos[t], qpos, atol=1e-10)
     assert at_limit
+
+
+def test_what_is_planned_is_what_its_version_says(env, task):
+    """Tasks, scenes, guesses, physics and costs; the planner itself is in the test of reach's experts."""
+
+    @jax.jit
+    def look(task, key):
+        start = env.reset(key, task)
+        guess = env.guess(task, start)
+        after = env.step(task, start, guess[0])
+        costs = env.running_residual(task, after, guess[1], jnp.int32(1)), env.terminal_residual(task, after)
+        fallen, _ = env.falls(task, after)
+        return task, start, guess[::10], after, costs, fallen
+
+    numbers = [np.ravel(x).astype(float) for x in jax.tree.leaves(look(task, jax.random.key(1)))]
+    planned.check("place", [env.version, VERSION], np.concatenate(numbers), atol=1e-5)
 
 
 def test_a_small_action_moves_the_hand_at_the_speed_it_asks_for(env, task):

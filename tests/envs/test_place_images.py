@@ -9,9 +9,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from milx.envs import place
 from milx.envs.base import State
-from milx.envs.place import NUM_CONTAINERS, NUM_JOINTS, Place
+from milx.envs.place import env as place
+from milx.envs.place.env import NUM_CONTAINERS, NUM_JOINTS, Place
 from milx.render.scene import Renderer, to_uint8
 
 

@@ -8,17 +8,18 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+import planned
 import pytest
 from mujoco import mjx
 
-from milx.envs import push
+from milx.data.goals import goals
 from milx.envs.base import State
-from milx.envs.push import NUM_JOINTS, Push
+from milx.envs.push import env as push
+from milx.envs.push.env import NUM_JOINTS, Push
 from milx.envs.shapes import SHAPES, SPLITS
 from milx.envs.shapes.primitives import NUM_CAPSULES, to_geoms
-from milx.goals import goals
 from milx.render.scene import Renderer, to_uint8
-from milx.trajopt.expert import perform
+from milx.trajopt.expert import VERSION, perform
 from milx.trajopt.ilqr import Options
 
 
@@ -107,6 +108,13 @@ def shown(env):
     tasks = jax.vmap(env.sample_task, in_axes=(0, None))(jax.random.split(jax.random.key(8), 32), "train")
     scenes, keys = scenes_of(env, tasks)
     return tasks, *perform(env, tasks, scenes, keys, Options(iterations=0), 0.1)
+
+
+def test_what_is_planned_is_what_its_version_says(env, shown):
+    """Tasks, scenes, physics, controller, tactics and noise: the first demonstration, at every tenth step."""
+    tasks, states, actions = shown
+    seen = tasks.shape[0], tasks.size[0], states.qpos[0, ::10], actions[0, ::10]
+    planned.check("push", [env.version, VERSION], np.concatenate([np.ravel(x) for x in seen]), atol=1e-4)
 
 
 def scenes_of(env, tasks):

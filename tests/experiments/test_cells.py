@@ -7,9 +7,9 @@ import sys
 import pytest
 from tiny import tiny_config
 
-from milx.training import save_state
+from milx.training.state import save_state
 
-sys.path.insert(0, str(pathlib.Path(__file__).parents[2] / "experiments"))
+sys.path.insert(0, str(pathlib.Path(__file__).parents[2] / "experiments" / "paper"))
 import cells
 
 

@@ -6,21 +6,21 @@ import sys
 
 import pytest
 
-sys.path.insert(0, str(pathlib.Path(__file__).parents[2] / "experiments"))
+sys.path.insert(0, str(pathlib.Path(__file__).parents[2] / "experiments" / "paper"))
 import ablations
 import cells
 import figure3
-import paper
-import paper_rows
+import published
+import published_rows
 import table
 import table1
 import table2
 import table3
 import tables
 
-from milx import envs, methods, training
-from milx.policy import spec_of
-from milx.presets import make_config
+from milx import envs, methods
+from milx.config.presets import make_config
+from milx.training import state
 
 
 def result(size, success, low, high, method="mil"):
@@ -37,7 +37,7 @@ def test_a_point_is_the_mean_of_its_seeds_within_all_their_intervals():
 
 @pytest.mark.parametrize("table", [table1.TABLE, table2.TABLE, table3.TABLE], ids=["table1", "table2", "table3"])
 def test_rows_are_trained_once_for_all_shots_and_each_on_its_own(table, tmp_path, flags):
-    spec, runner, programs = spec_of(envs.make(table.env, (48, 48))), cells.Cells(tmp_path, 1), set()
+    spec, runner, programs = envs.make(table.env, (48, 48)).spec, cells.Cells(tmp_path, 1), set()
     for row in table.rows.values():
         of_shots = [tables.configure(table.env, row, shots, seed=0) for shots in table.shots]
         methods.make(of_shots[0], spec)  # refuses what does not fit together
@@ -100,22 +100,22 @@ def flags():
     saved.rows = None
 
 
-PAPER = [(name, row) for rows in paper_rows.TABLES.values() for name, row in rows.items()]
+PAPER = [(name, row) for rows in published_rows.TABLES.values() for name, row in rows.items()]
 
 
 @pytest.mark.parametrize(("name", "row"), PAPER, ids=[name for name, _ in PAPER])
 def test_rows_of_the_published_method_fit_together_and_have_no_addition_unless_they_say_so(name, row):
-    config = paper_rows.configure(row, row.shots[0], seed=0)
-    methods.make(config, spec_of(envs.make(row.env, (48, 48))))
-    training.check_steps(config)
+    config = published_rows.configure(row, row.shots[0], seed=0)
+    methods.make(config, envs.make(row.env, (48, 48)).spec)
+    state.check_steps(config)
     additions = config.network.goal_head, config.train.redraw, config.mil.learn_inner_lr
-    assert not any(additions) or row in paper_rows.TABLES["ladder"].values()
+    assert not any(additions) or row in published_rows.TABLES["ladder"].values()
 
 
 @pytest.mark.parametrize("env", ["reach", "push"])
 def test_the_ladder_ends_with_fast(env):
-    last = [row for name, row in paper_rows.TABLES["ladder"].items() if row.env == env][-1]
-    config = dataclasses.replace(paper_rows.configure(last, 1, seed=0), preset="fast")
+    last = [row for name, row in published_rows.TABLES["ladder"].items() if row.env == env][-1]
+    config = dataclasses.replace(published_rows.configure(last, 1, seed=0), preset="fast")
     assert config == make_config(env, preset="fast", seed=0)
 
 
@@ -127,12 +127,12 @@ def test_intervals_of_one_table_are_of_one_kind():
 
 def test_results_of_the_published_method_are_of_their_rows_and_in_the_docs():
     root = pathlib.Path(__file__).parents[2]
-    for table_name, rows in paper_rows.TABLES.items():
+    for table_name, rows in published_rows.TABLES.items():
         folder = root / "experiments" / "results" / f"paper_{table_name}"
         for name, row in rows.items():
             for path in folder.glob(f"{name}-[0-9]-[0-9].json"):
                 shots, seed = (int(part) for part in path.stem.split("-")[-2:])
-                assert cells.Cells(folder, 1).is_done(path.stem, paper_rows.configure(row, shots, seed))
+                assert cells.Cells(folder, 1).is_done(path.stem, published_rows.configure(row, shots, seed))
     results = root / "experiments" / "results" / "paper_results"
-    printed = paper.markdown(paper_rows.TABLES["results"], cells.read(results))
+    printed = published.markdown(published_rows.TABLES["results"], cells.read(results))
     assert printed in (root / "docs" / "paper.md").read_text()

@@ -6,17 +6,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
-from milx import exported, listening
-from milx.config import Config, EnvConfig, MILConfig, NetworkConfig
 from milx.export import export
-from milx.methods import Spec
-from milx.methods.maml import MIL
-from milx.networks.policy import make_policy
-from milx.policy import Policy
-from milx.rollout import replay
-from milx.types import Demo, Observation, TaskBatch
-from milx.whitening import Whitening
+
+from milx.config.schema import Config, EnvConfig, MILConfig, NetworkConfig
+from milx.deploy import standalone
+from milx.deploy.policy import Policy
+from milx.evaluation import listening
+from milx.evaluation.rollout import replay
+from milx.methods.mil import MIL
+from milx.methods.whitening import Whitening
+from milx.networks.policy_network import make_policy
+from milx.types import Demo, Observation, Spec, TaskBatch
 
 IMAGE_SHAPE, STATE, ACTION, STEPS, INDICES = (8, 10), 4, 2, 5, (1, 3)
 WHITENING = Whitening(np.full(STATE, 0.1), np.full(STATE, 2.0), np.full(ACTION, 0.3), np.full(ACTION, 0.5))
@@ -91,7 +91,7 @@ def test_policies_with_a_memory_act_step_by_step(case, tmp_path):
         params = method.init(jax.random.key(0), single(WHITENING))
         policy = Policy(method, spec, params, config)
         export(policy, tmp_path / "out")
-        alone = exported.Policy(tmp_path / "out")
+        alone = standalone.Policy(tmp_path / "out")
         one = {"image": np.asarray(demo.image[0]), "state": np.asarray(demo.state[0], np.float32)}
         shown = one | {"action": np.asarray(demo.action[0], np.float32)}
         learnt = policy.adapt(policy.params, Demo(**shown)), alone.adapt(**shown)

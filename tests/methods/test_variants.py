@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from milx import methods
-from milx.config import VARIANTS, Config, MILConfig, NetworkConfig
-from milx.methods.maml import MIL
-from milx.networks.policy import PolicyNetwork, PolicyOutput, make_policy
-from milx.pytrees import leaves
-from milx.types import Demo, TaskBatch
-from milx.whitening import Whitening
+from milx.config.schema import VARIANTS, Config, MILConfig, NetworkConfig
+from milx.core.pytrees import leaves
+from milx.methods.mil import MIL
+from milx.methods.whitening import Whitening
+from milx.networks.policy_network import PolicyNetwork, PolicyOutput, make_policy
+from milx.types import Demo, Spec, TaskBatch
 
 STATE, ACTION, TASKS, STEPS = 4, 2, 3, 5
 THETA = np.array([0.4, -1.3])
@@ -122,4 +122,4 @@ def test_a_variant_that_cannot_be_is_refused(changes, message):
         holder = config if "." not in name else getattr(config, name.split(".")[0])
         setattr(holder, name.split(".")[-1], value)
     with pytest.raises(ValueError, match=message):
-        methods.make(config, methods.Spec(None, STATE, ACTION, None, ()))
+        methods.make(config, Spec(None, STATE, ACTION, None, ()))

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from milx.config import NetworkConfig
+from milx.config.schema import NetworkConfig
 from milx.networks.attention import AttentiveActor, ObjectTokens, split_objects
 
 STATE, ACTION, STEPS, BATCH = 7, 2, 5, 4

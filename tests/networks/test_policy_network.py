@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from milx.config import NetworkConfig
-from milx.networks.policy import make_policy
+from milx.config.schema import NetworkConfig
+from milx.networks.policy_network import make_policy
 
 IMAGE_SHAPE, STATE, ACTION, GOAL, BATCH = (8, 10), 3, 2, 2, 6
 TINY = {"filters": (4, 4), "strides": (2, 2), "fc_layers": (8,), "bias_transformation": 5}

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+import planned
 import pytest
 
 import milx
@@ -48,6 +49,13 @@ def test_without_noise_the_expert_reaches_every_target_within_reach(demonstratio
     within_reach = np.linalg.norm(target, axis=-1) < REACHABLE
     assert within_reach.sum() > 0.8 * SCENES
     assert success[within_reach, 0].mean() >= 0.97
+
+
+def test_what_is_planned_is_what_its_version_says(env, demonstrations):
+    """Tasks, scenes, physics, costs, iLQR and noise: the first scene's two demonstrations, at every tenth step."""
+    _, _, states, actions, _ = demonstrations
+    seen = states.mocap_pos[0, 0, 0], states.qpos[0, :, ::10], actions[0, :, ::10]
+    planned.check("reach", [env.version, expert.VERSION], np.concatenate([np.ravel(x) for x in seen]), atol=2e-3)
 
 
 def test_without_noise_a_demonstration_is_the_plan(demonstrations):

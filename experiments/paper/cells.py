@@ -1,0 +1,301 @@
+"""Runs that make up a figure: one JSON file each, with demonstrations and compiled programs shared.
+
+Cells that differ only in seed and number of training tasks share every program: their demonstrations are the first of
+one larger set, repeated to its size, so that shapes stay the same.
+"""
+
+import contextlib
+import dataclasses
+import hashlib
+import itertools
+import json
+import pathlib
+import shutil
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from milx import envs, methods
+from milx.config import schema
+from milx.config.presets import make_config
+from milx.config.schema import Config
+from milx.core import platform, pytrees
+from milx.core.checkpoint import Checkpoints
+from milx.data import simulated as demos_lib
+from milx.data.simulated import DemoSet
+from milx.evaluation import closed_loop, listening, provenance, results
+from milx.training import signals
+from milx.training.metrics import MetricsWriter, read_metrics
+from milx.training.simulated import result_of, split_demos, training_on, trial_key, validation_of
+from milx.training.state import Training, check_steps, initial_state, restore_state, save_state
+from milx.training.update import Trainer, make_optimizer
+from milx.types import Params
+
+METHODS = {
+    "reach": ("mil", "contextual", "lstm"),
+    "reach_state": ("mil", "contextual", "lstm", "lstm_attention"),
+    "push": ("mil", "contextual", "lstm"),
+    "place": ("mil", "contextual", "lstm"),
+}
+"""What is compared in each environment."""
+
+STEPS = {"reach": 12_000, "reach_state": 10_000, "push": 30_000, "place": 20_000}
+"""Meta-updates of every method."""
+
+LEARNING_RATES = {
+    "reach": {"mil": 3e-3, "contextual": 3e-4, "lstm": 3e-4},
+    "reach_state": {"mil": 3e-3, "contextual": 3e-3, "lstm": 3e-3, "lstm_attention": 3e-4},
+    "push": {"mil": 3e-3, "contextual": 3e-4, "lstm": 3e-4},
+    "place": {"mil": 3e-3, "contextual": 3e-4, "lstm": 3e-4},
+}
+"""Peaks of the cosine, as `tune.py` found them on validation tasks; those of place, and of MIL on push, are reach's."""
+
+
+def methods_of(env: str, chosen: list[str] | None) -> list[str]:
+    """The methods of an environment, or those of them that were chosen.
+
+    Raises:
+        ValueError: for a method that no environment compares; the message lists those that are.
+    """
+    compared = sorted(set(itertools.chain(*METHODS.values())))
+    if unknown := sorted(set(chosen or ()) - set(compared)):
+        raise ValueError(f"methods: got {unknown[0]!r}, expected some of {', '.join(compared)}")
+    return [method for method in METHODS[env] if chosen is None or method in chosen]
+
+
+def configure(env: str, method: str, preset: str, seed: int, steps: int | None) -> Config:
+    """A preset as methods are compared: at their own rates, in `steps` meta-updates or STEPS, without redrawn scenes.
+
+    A small set of demonstrations is to be small in colours and places, too. On vision reach eight time steps of the
+    query and three layers learn faster than the three and two of `fast`, which end a little higher.
+    """
+    config = make_config(env, method, preset, seed)
+    config.train.steps = steps or STEPS[env]
+    config.train.eval_every = min(4000, config.train.steps)
+    config.train.redraw = False
+    if (method, preset) != ("mil", "paper"):  # which has its own
+        config.optimizer.learning_rate = LEARNING_RATES[env][method]
+    if env == "reach" and config.train.query_frames is not None:
+        config.train.query_frames = 8
+        config.network.fc_layers = config.network.fc_layers[:1] * 3
+    return config
+
+
+class Trained(NamedTuple):
+    """What did best on validation tasks.
+
+    Attributes:
+        params: its parameters.
+        step: after how many meta-updates.
+        validation: its success there.
+        seconds: what compiling the training ("compile"; 0 if an earlier cell did), training and validating took.
+        curve: what every validation found, with the "step" and the training "loss".
+    """
+
+    params: Params
+    step: int
+    validation: float
+    seconds: dict[str, float]
+    curve: list[dict[str, Any]]
+
+
+class Cells:
+    """Runs cells, each a configuration with a name, and keeps what later ones can use again.
+
+    A process that is killed leaves the checkpoint of its last validation in `unfinished/` beside the result files. The
+    next one goes on from there if all is the same: configuration, demonstrations, commit, hardware and versions.
+
+    Args:
+        folder: where the result files are.
+        capacity: tasks in the largest cell.
+    """
+
+    def __init__(self, folder: pathlib.Path, capacity: int):
+        self.folder, self.capacity = folder, capacity
+        self._made: dict[Any, Any] = {}
+        self._unneeded: list[pathlib.Path] = []
+
+    def is_done(self, name: str, config: Config) -> bool:
+        """Whether the cell has its file.
+
+        Raises:
+            ValueError: if the file is another configuration's; the message shows the difference.
+        """
+        path = self.folder / f"{name}.json"
+        if not path.is_file():
+            return False
+        theirs = schema.from_dict(json.loads(path.read_text())["config"])
+        if changed := schema.differences(_contents(theirs), _contents(config)):
+            raise ValueError(f"{path}: holds another cell: {'; '.join(changed)}")
+        return True
+
+    def run(self, named: dict[str, Config]) -> None:
+        """Trains and evaluates those of the cells that are not done, and writes `name`.json of each.
+
+        Cells that differ in their evaluation only are trained once and written together at the end. Times of
+        demonstrations and baselines count for the cell that was the first to need them.
+        """
+        missing = {name: config for name, config in named.items() if not self.is_done(name, config)}
+        for config in missing.values():
+            self._check(config)
+        finished = {name: self._run(name, config) for name, config in missing.items()}
+        for name, result in finished.items():
+            self.write(name, result)
+            print(f"{name}: {result['success']:.1%}, {result['wall_clock_s']['total']:.0f} s", flush=True)
+        self.forget()
+
+    def _run(self, name: str, config: Config) -> dict[str, Any]:
+        clock = [time.perf_counter()]
+        env, method, evaluation = self._env(config), self._trainer(config).method, config.evaluation
+        train, test = self._first_tasks(config), self._demos(config, "test")
+        floors = self._once(
+            ("floors", env),
+            lambda: closed_loop.baselines(env, test, evaluation, config.data, trial_key("test")),
+        )
+        clock.append(time.perf_counter())
+        trained = self.train(name, config)
+        clock.append(time.perf_counter())
+        _, found = result_of(env, method, trained.params, test, config, floors)
+        clock.append(time.perf_counter())
+        demos_s, _, evaluate_s = (later - earlier for earlier, later in itertools.pairwise(clock))
+        seconds = {"demos": demos_s, **trained.seconds, "evaluate": trained.seconds["evaluate"] + evaluate_s}
+        seconds["total"] = sum(seconds.values())
+        digest = pytrees.fingerprint(train)
+        result = results.describe(config, found, seconds, trained.step, digest)
+        return result | {"validation_success": trained.validation, "curve": trained.curve}
+
+    def write(self, name: str, result: dict[str, Any]) -> None:
+        """Writes a cell's file."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        results.write_json(self.folder / f"{name}.json", result)
+
+    def forget(self) -> None:
+        """Deletes the checkpoints of the cells trained so far, once they have their files."""
+        while self._unneeded:
+            shutil.rmtree(self._unneeded.pop())
+
+    def train(self, name: str, config: Config) -> Trained:
+        """Meta-trains a cell; what differs in its evaluation only is not trained again.
+
+        Raises:
+            ValueError: if the number of tasks does not divide the capacity, the steps are not whole scans, another
+                process trains this cell, or its last checkpoint could not be written.
+        """
+        self._check(config)
+        return self._once(
+            ("trained", self._programs(config), config.seed, config.data.tasks), lambda: self._train(name, config)
+        )
+
+    def _check(self, config: Config) -> None:
+        if self.capacity % config.data.tasks:
+            raise ValueError(f"data.tasks: got {config.data.tasks}, expected a divisor of {self.capacity}")
+        check_steps(config)
+
+    def _train(self, name: str, config: Config) -> Trained:
+        times = self.capacity // config.data.tasks
+        repeated = jax.tree.map(lambda x: jnp.concatenate([x] * times), self._first_tasks(config))
+        training = training_on(self._env(config), config, repeated)
+        folder = self._unfinished(config, training.dataset_hash)
+        folder.mkdir(parents=True, exist_ok=True)
+        with signals.one_trainer(folder), contextlib.closing(Checkpoints(folder / "checkpoints")) as checkpoints:
+            trained = self._fit(name, config, training, checkpoints)
+        self._unneeded.append(folder)
+        return trained
+
+    def _unfinished(self, config: Config, dataset_hash: str) -> pathlib.Path:
+        """Where a cell's checkpoints are until it has its file: a folder for all on which they depend."""
+        contents = json.dumps([_contents(config), dataset_hash, provenance.describe()])
+        return self.folder / "unfinished" / hashlib.sha256(contents.encode()).hexdigest()[:16]
+
+    def _fit(self, name: str, config: Config, training: Training, checkpoints: Checkpoints) -> Trained:
+        env, trainer, every = self._env(config), self._trainer(config), config.train.log_every
+        evaluation = dataclasses.replace(config.evaluation, shots=config.train.shots)
+        validation = self._demos(dataclasses.replace(config, evaluation=evaluation), "validation")
+        data = training.at(0)
+        state, key = initial_state(trainer, config, training)
+        seconds, began = dict.fromkeys(("compile", "train", "evaluate"), 0.0), time.perf_counter()
+        if checkpoints.latest is not None:
+            state, seconds = restore_state(checkpoints, checkpoints.latest, state, training.dataset_hash)
+            print(f"  {name}: goes on from step {int(state.step)}", flush=True)
+
+        def lap(name: str) -> None:
+            nonlocal began
+            now = time.perf_counter()
+            seconds[name] += now - began
+            began = now
+
+        options = platform.pixel_options(env.chain)
+        compiled = self._once(
+            ("compiled", self._programs(config)),
+            lambda: Trainer.run.lower(trainer, state, data, key, every).compile(options),
+        )
+        lap("compile")
+        step, written = int(state.step), True
+        log = MetricsWriter(checkpoints.folder.parent, step, print)
+        while step < config.train.steps:
+            state, metrics = compiled(state, data, key)
+            step += every
+            if step % config.train.eval_every == 0 or step == config.train.steps:
+                loss = float(metrics["loss"])
+                lap("train")
+                success, heard = validation_of(env, trainer.method, state.params, validation, evaluation)
+                log.write(step, {"loss": loss, "validation_success": success, **heard})
+                lap("evaluate")
+                said = listening.describe(heard)
+                print(f"  {name} {step}: loss {loss:.3f}, validation {success:.1%}{said}", flush=True)
+                written = save_state(checkpoints.save, state, success, seconds, training.dataset_hash)
+                lap("evaluate")
+        log.close()
+        best = checkpoints.best
+        if best is None or not written:
+            raise ValueError(f"{checkpoints.folder}: the checkpoint of step {step} could not be written")
+        params = checkpoints.restore(best, {"params": state.params})[0]["params"]
+        curve = read_metrics(checkpoints.folder.parent / "metrics.jsonl")
+        return Trained(params, best, checkpoints.score(best), seconds, curve)
+
+    def _trainer(self, config: Config) -> Trainer:
+        env = self._env(config)
+        optimizer = make_optimizer(config.optimizer, config.train.steps)
+        method = methods.make(config, env.spec)
+        make = lambda: Trainer(demos_lib.sampler(env, config.train), method, config.train, optimizer)  # noqa: E731
+        return self._once(("trainer", self._programs(config)), make)
+
+    def _env(self, config: Config) -> envs.Env:
+        world = config.env_name, config.env.image_shape, config.env.action_cost
+        return self._once(("env", *world), lambda: envs.make(*world))
+
+    def _programs(self, config: Config) -> str:
+        """All on which the compiled programs of training depend."""
+        values = schema.to_dict(config)
+        del values["seed"], values["evaluation"], values["data"]["tasks"]
+        return json.dumps(values)
+
+    def _first_tasks(self, config: Config) -> DemoSet:
+        return jax.tree.map(lambda x: x[: config.data.tasks], self._demos(config, "train"))
+
+    def _demos(self, config: Config, split: str) -> DemoSet:
+        """Validation or test tasks, or the training tasks of the largest cell with the same seed."""
+        whole = dataclasses.replace(config, data=dataclasses.replace(config.data, tasks=self.capacity))
+        env = self._env(config)
+        which = config.seed if split == "train" else config.evaluation.shots
+        return self._once(("demos", env, split, which), lambda: split_demos(env, whole, split))
+
+    def _once(self, key: Any, make: Callable[[], Any]) -> Any:
+        if key not in self._made:
+            self._made[key] = make()
+        return self._made[key]
+
+
+def _contents(config: Config) -> dict[str, Any]:
+    """What makes a cell: how much runs at once does not."""
+    values = schema.to_dict(config)
+    del values["evaluation"]["batch"], values["data"]["plan_batch"]
+    return values
+
+
+def read(folder: pathlib.Path) -> dict[str, dict[str, Any]]:
+    """All results of a folder, by the names of their cells."""
+    return {path.stem: json.loads(path.read_text()) for path in sorted(folder.glob("*.json"))}

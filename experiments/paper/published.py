@@ -1,0 +1,92 @@
+"""The method as published: its results, why it learns, and what milx's additions are worth on top of it.
+
+    python experiments/paper/published.py --table=results     # what is missing, then the table; --show runs nothing
+    python experiments/paper/published.py --table=plateau --rows=released,whitened --seeds=1
+    python experiments/paper/published.py --table=plateau --show --curves=docs/plateau.png
+
+The other tables are `baselines`, `ladder` and `relatives` (`published_rows.py` says what each of their rows changes).
+Stopped and started again it goes on with its last checkpoint.
+"""
+
+import statistics
+from typing import Any
+
+import cells
+import matplotlib.pyplot as plt
+import options
+from absl import app, flags
+from published_rows import TABLES, Row, configure
+from tables import chosen, interval
+
+import milx
+
+for _name in ("seeds", "show", "out", "rows"):  # the others of options.py do nothing here
+    flags.declare_key_flag(_name)
+_TABLE = flags.DEFINE_enum("table", "results", list(TABLES), "Which table.")
+_SEED = flags.DEFINE_integer("first_seed", 0, "The first of the seeds.")
+_CURVES = flags.DEFINE_string("curves", None, "Where to draw the learning curves; default nowhere.")
+
+
+def main(_: list[str]) -> None:
+    """Runs what is missing and prints a table."""
+    milx.configure()
+    rows, folder = chosen(TABLES[_TABLE.value]), options.folder(f"paper_{_TABLE.value}")
+    runners: dict[str, cells.Cells] = {}
+    for seed in range(_SEED.value, _SEED.value + options.SEEDS.value):
+        for name, row in {} if options.SHOW.value else rows.items():
+            named = {f"{name}-{shots}-{seed}": configure(row, shots, seed) for shots in row.shots}
+            tasks = configure(row, 1, seed).data.tasks
+            runners.setdefault(row.env, cells.Cells(folder, tasks)).run(named)
+    found = cells.read(folder)
+    print(markdown(rows, found))
+    if _CURVES.value:
+        draw(rows, found, _CURVES.value)
+
+
+def _runs(name: str, shots: int, found: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:
+    """The result files of a row's seeds."""
+    return [run for cell, run in found.items() if cell.rpartition("-")[0] == f"{name}-{shots}"]
+
+
+def markdown(rows: dict[str, Row], found: dict[str, dict[str, Any]]) -> str:
+    """A table of what there is: the mean of the seeds, their intervals, the paper's number and the floors."""
+    lines = ["| | success | with another task's | random | task-blind | expert | training | paper |"]
+    lines.append("|---|---|---|---|---|---|---|---|")
+    for name, row in rows.items():
+        columns = [_runs(name, shots, found) for shots in row.shots]
+        if not all(columns):
+            continue
+        shown = " / ".join(interval(runs) for runs in columns)
+        floors = [
+            f"{statistics.mean(run['baselines'][floor] for run in columns[0]):.1%}"
+            if floor in columns[0][0]["baselines"]
+            else ""  # not measured yet when it ran
+            for floor in ("other_demo", "random", "task_blind", "expert")
+        ]
+        seconds = f"{statistics.mean(run['wall_clock_s']['train'] for run in columns[0]):.0f} s"
+        lines.append(f"| {row.label} | {shown} | {' | '.join(floors)} | {seconds} | {row.published} |")
+    return "\n".join(lines)
+
+
+def draw(rows: dict[str, Row], found: dict[str, dict[str, Any]], path: str) -> None:
+    """Draws validation success, and by how much another task's demonstration is worse, against the meta-updates."""
+    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4), layout="constrained")
+    colors = [*plt.get_cmap("tab10").colors, *plt.get_cmap("Set2").colors]
+    for number, (name, row) in enumerate(rows.items()):
+        with_curve = [run for run in _runs(name, row.shots[0], found) if "curve" in run]
+        for i, run in enumerate(with_curve):
+            label = None if i else row.label.replace("`", "")
+            style = {"color": colors[number % len(colors)], "lw": 1.2, "label": label}
+            steps = [line["step"] for line in run["curve"]]
+            left.plot(steps, [100 * line["validation_success"] for line in run["curve"]], **style)
+            right.plot(steps, [line["other_demo"] / line["own_demo"] for line in run["curve"]], **style)
+    left.set(xlabel="meta-updates", ylabel="success on validation tasks (%)", ylim=(0, 100))
+    right.set(xlabel="meta-updates", ylabel="error: another task's demonstration / its own")
+    right.axhline(1.0, color="0.6", lw=0.8)
+    left.legend(fontsize=7)
+    figure.savefig(path, dpi=150)
+    plt.close(figure)
+
+
+if __name__ == "__main__":
+    app.run(main)

@@ -1,0 +1,193 @@
+"""What `published.py` trains: rows of tables, each the preset `paper` with some fields changed."""
+
+from typing import Any, NamedTuple
+
+from milx.config import schema
+from milx.config.presets import make_config
+from milx.config.schema import Config
+
+
+class Row(NamedTuple):
+    """A way to train.
+
+    Attributes:
+        label: what the table calls it.
+        env: the environment.
+        changes: what is changed of the preset `paper`, by dotted name.
+        published: what the paper reports.
+        shots: demonstrations at test, a result for each.
+        method: the method.
+    """
+
+    label: str
+    env: str
+    changes: dict[str, Any]
+    published: str = ""
+    shots: tuple[int, ...] = (1,)
+    method: str = "mil"
+
+
+def configure(row: Row, shots: int, seed: int) -> Config:
+    """A cell of a table."""
+    config = make_config(row.env, row.method, "paper", seed)
+    config.evaluation.shots = shots
+    for name, value in row.changes.items():
+        schema.assign(config, name, value)
+    return config
+
+
+def _without(changes: dict[str, Any], *groups: str) -> dict[str, Any]:
+    """The changes but for the fields whose names begin so."""
+    return {name: value for name, value in changes.items() if not name.startswith(groups)}
+
+
+RELEASED = {
+    "mil.whiten_actions": False,
+    "mil.loss_scale": 100.0,
+    "mil.inner_lr": 1e-3,
+    "network.fc_init_std": 0.01,
+    "optimizer.warmup": 0.0,
+    "optimizer.cosine": False,
+    "optimizer.clip_norm": None,
+    "train.imitation_steps": 0,
+}
+"""What turns reach's `paper` back into the numbers of the released code."""
+_RAW = {name: value for name, value in RELEASED.items() if name.startswith("mil.")}
+_AT_ONCE = {"env.action_cost": 1.0}
+_NO_IMITATION = {"train.imitation_steps": 0}
+_SHORT = {"train.steps": 5000, "train.eval_every": 1000}
+_PLATEAU = {
+    "released": ("the released numbers", RELEASED),
+    "whitened": ("+ whitened actions", _without(RELEASED, "mil.")),
+    "one-rate": (
+        "+ whitened actions, the inner rate of the layers before the last",
+        _without(RELEASED, "mil.") | {"mil.inner_lr": 1.6e-3},
+    ),
+    "lecun": ("+ LeCun's start", _without(RELEASED, "mil.", "network.")),
+    "schedule": ("+ clip, warm-up, cosine", _NO_IMITATION),
+    "imitation": ("+ imitation first: `paper`", {}),
+    "raw": ("`paper` without whitened actions", _RAW),
+    "small-start": ("`paper`, weights from N(0, 0.01)", {"network.fc_init_std": 0.01}),
+    "five-tasks": ("`paper`, five tasks in a meta-batch", {"train.meta_batch": 5}),
+    "three-frames": (
+        "`paper`, 3 time steps of 64 tasks",
+        {"train.support_frames": 3, "train.query_frames": 3, "train.meta_batch": 64},
+    ),
+    "at-once": ("`paper`, an expert that moves at once", _AT_ONCE),
+    "at-once-schedule": ("the same without imitation first", _AT_ONCE | _NO_IMITATION),
+    "at-once-whitened": ("+ whitened actions alone, that expert", _AT_ONCE | _without(RELEASED, "mil.")),
+    "at-once-released": ("the released numbers, that expert", _AT_ONCE | RELEASED),
+}
+
+_VIDEO_STATE = {"mil.given": "video+state", "network.learned_loss": "linear"}
+_VIDEO = {"mil.given": "video", "network.learned_loss": "linear", "network.heads": 2, "network.inner_first_layer": True}
+_RESULTS = {
+    "reach": Row("reach, vision", "reach", {}, "a curve"),
+    "reach-state": Row("reach, states (three possible tasks)", "reach_state", {}, "a curve"),
+    "push": Row("push, one head", "push", {"network.heads": 1}, "80.6 / 82.6%", (1, 5)),
+    "push-two-heads": Row("push, two heads", "push", {}, "85.8 / 88.8%", (1, 5)),
+    "push-video-state": Row("push, video + state", "push", _VIDEO_STATE, "72.5 / 78.2%", (1, 5)),
+    "push-video": Row("push, video", "push", _VIDEO, "66.4 / 70.5%", (1, 5)),
+    "place": Row("place", "place", {}, "90%"),
+    "place-video": Row("place, video", "place", _VIDEO, "68.3%"),
+}
+
+_SLOWER = {"optimizer.learning_rate": 3e-4}
+_BASELINES = {
+    f"{env}-{method}-{given.replace('+', '-')}": Row(
+        f"{env}, {label}, {given}", env, _SLOWER | {"mil.given": given}, published, shots, method
+    )
+    for env, shots, method, label, given, published in (
+        ("push", (1, 5), "lstm", "LSTM", "video+state+action", "78.4 / 83.1%"),
+        ("push", (1, 5), "lstm", "LSTM", "video+state", "37.6 / 39.6%"),
+        ("push", (1, 5), "lstm", "LSTM", "video", "34.2 / 32.0%"),
+        ("push", (1, 5), "contextual", "contextual", "video+state", "58.1 / 64.6%"),
+        ("push", (1, 5), "contextual", "contextual", "video", "57.0 / 59.0%"),
+        ("place", (1,), "lstm", "LSTM", "video+state+action", "25%"),
+        ("place", (1,), "contextual", "contextual", "video+state+action", "25%"),
+    )
+}
+
+_GOAL_HEAD = {"network.goal_head": True, "mil.goal_weight": 1.0, "network.calibrate": False}
+_STEPS = {
+    "reach": (
+        ("sampled", "3 time steps of 64 tasks", _PLATEAU["three-frames"][1]),
+        ("redrawn", "looks and distractors redrawn", {"train.redraw": True}),
+        ("rates", "learned inner rates", {"mil.learn_inner_lr": True}),
+        (
+            "network",
+            "soft-argmax and the network of `fast`",
+            {
+                "network.soft_argmax": True,
+                "network.strides": (2, 2, 1),
+                "network.fc_layers": (200, 200),
+                "network.fc_norm": True,
+                "network.mixed_precision": True,
+            },
+        ),
+        ("goal-head", "goal head", _GOAL_HEAD),
+        ("calibrated", "votes from the camera's calibration", {"network.calibrate": True}),
+        ("fast", "36,000 updates, none without an inner step: `fast`", {"train.steps": 36_000} | _NO_IMITATION),
+    ),
+    "push": (
+        ("one-head", "one head", {"network.heads": 1}),
+        (
+            "sampled",
+            "4 and 8 time steps of 32 tasks",
+            {"train.support_frames": 4, "train.query_frames": 8, "train.meta_batch": 32},
+        ),
+        ("redrawn", "looks redrawn", {"train.redraw": True}),
+        ("rates", "learned inner rates", {"mil.learn_inner_lr": True}),
+        (
+            "network",
+            "the network and rate of `fast`",
+            {
+                "network.filters": (32,) * 4,
+                "network.strides": (2, 2, 2, 1),
+                "network.fc_norm": True,
+                "optimizer.learning_rate": 3e-3,
+            },
+        ),
+        ("goal-head", "goal head", _GOAL_HEAD),
+        ("calibrated", "votes from the camera's calibration", {"network.calibrate": True}),
+        (
+            "fast",
+            "30,000 updates, none without an inner step, clip 20: `fast`",
+            {"train.steps": 30_000, "mil.inner_clip": 20.0} | _NO_IMITATION,
+        ),
+    ),
+}
+
+
+def _ladder() -> dict[str, Row]:
+    """From `paper` to `fast`, one of milx's changes at a time on top of those before it."""
+    rows = {}
+    for env, steps in _STEPS.items():
+        changes: dict[str, Any] = {}
+        for name, label, more in steps:
+            changes = changes | more
+            rows[f"{env}-{name}"] = Row(f"{env}: + {label}", env, changes)
+    return rows
+
+
+_TWO_STEPS = {"mil.inner_steps": 2}
+_RELATIVES = {
+    f"{env}-{name}": Row(f"{env}: {label}", env, changes | ({"network.heads": 1} if env == "push" else {}))
+    for env in ("reach", "push")
+    for name, label, changes in (
+        ("anil", "the last layer only (ANIL)", {"mil.variant": "anil"}),
+        ("boil", "all but the last layer (BOIL)", {"mil.variant": "boil"}),
+        ("cavia", "the bias transformation only (CAVIA)", {"mil.variant": "cavia"}),
+        ("two-steps", "two inner steps", _TWO_STEPS),
+        ("multi-step", "two inner steps, the loss after each (MAML++)", _TWO_STEPS | {"mil.variant": "multi_step"}),
+    )
+}
+
+TABLES: dict[str, dict[str, Row]] = {
+    "results": _RESULTS,
+    "plateau": {name: Row(label, "reach", _SHORT | changes) for name, (label, changes) in _PLATEAU.items()},
+    "baselines": _BASELINES,
+    "ladder": _ladder(),
+    "relatives": _RELATIVES,
+}
+"""The rows of every table, by name."""

@@ -1,0 +1,1 @@
+"""Configurations: what they hold, which values they may have, and the presets."""

@@ -1,0 +1,1 @@
+"""What every layer above builds on: devices, batches, pytrees, checkpoints, small linear algebra."""

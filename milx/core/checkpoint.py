@@ -1,0 +1,285 @@
+"""Checkpoints through Orbax: the latest and the best kept, each with checksums of its files.
+
+A checkpoint that is damaged is reported and the one before it is used. In a run that goes on it is moved aside, to
+`damaged/` beside the checkpoints, so that nothing is lost and its step can be written again.
+"""
+
+import contextlib
+import hashlib
+import json
+import os
+import pathlib
+import shutil
+import sys
+import tempfile
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import orbax.checkpoint as ocp
+from orbax.checkpoint import checkpoint_managers as policies
+
+from milx.core import parallel
+
+UNVALIDATED = -1e9
+"""The score of a checkpoint that nobody has validated: it is the best only where there is no other."""
+_CHECKSUMS = "checksums.json"
+_METADATA = "_CHECKPOINT_METADATA"
+
+
+def _to_stderr(message: str) -> None:
+    print(f"milx: {message}", file=sys.stderr, flush=True)
+
+
+class Checkpoints:
+    """The checkpoints of a run.
+
+    Args:
+        folder: where they lie; made if missing.
+        read_only: look only, never write.
+        report: told of what is damaged or could not be written.
+
+    Raises:
+        ValueError: if there are checkpoints and all of them are damaged.
+    """
+
+    def __init__(self, folder: pathlib.Path, read_only: bool = False, report: Callable[[str], None] = _to_stderr):
+        self.folder, self._read_only, self._report = folder.absolute(), read_only, report
+        self._view: tempfile.TemporaryDirectory | None = None
+        self._manager = self._open(self._without_damaged())
+
+    @property
+    def latest(self) -> int | None:
+        """Step of the newest checkpoint; None if there is none."""
+        return self._manager.latest_step()
+
+    @property
+    def best(self) -> int | None:
+        """Step of the checkpoint with the highest score; None if there is none."""
+        return self._manager.best_step()
+
+    def save(self, step: int, items: dict[str, Any], score: float, extra: dict[str, Any]) -> bool:
+        """Writes pytrees of arrays; where it cannot, say on a full disk, it reports that and leaves the others alone.
+
+        Args:
+            step: meta-updates done.
+            items: pytrees by name; each can be restored alone.
+            score: of the validation, by which the best checkpoint is chosen, or UNVALIDATED.
+            extra: numbers to restore beside the arrays, as JSON.
+
+        Returns:
+            Whether it is written.
+        """
+        saves = {name: ocp.args.StandardSave(jax.tree.map(_stored, tree)) for name, tree in items.items()}
+        args = ocp.args.Composite(**saves, extra=ocp.args.JsonSave(extra))
+        try:
+            self._manager.save(step, args=args, metrics={"success": score})
+            self._manager.wait_until_finished()
+            if parallel.is_first_host():
+                _write_checksums(self.folder / str(step))
+        except Exception as error:  # from threads of several libraries, with types of their own
+            self._manager = self._open(self.folder)
+            if self.latest == step and not _damage(self.folder / str(step)):
+                self._report(f"checkpoint of step {step}: its checksums could not be written: {error}")
+                return True
+            kept = "there is none before it" if self.latest is None else f"the last good one is of step {self.latest}"
+            self._report(
+                f"checkpoint of step {step} could not be written, {kept}: {str(error).strip().splitlines()[0]}"
+            )
+            return False
+        return True
+
+    def restore(self, step: int, like: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Reads a checkpoint.
+
+        Args:
+            step: which.
+            like: the items to restore, as pytrees of arrays or shapes with their structure.
+
+        Returns:
+            The items and the extra numbers.
+
+        Raises:
+            ValueError: if it does not hold these items.
+        """
+        restores = {name: ocp.args.StandardRestore(jax.tree.map(_stored, tree)) for name, tree in like.items()}
+        try:
+            restored = self._manager.restore(step, args=ocp.args.Composite(**restores, extra=ocp.args.JsonRestore()))
+        except Exception as error:  # Orbax and tensorstore have many types
+            reason = f"{type(error).__name__}: {str(error).strip().splitlines()[0]}"
+            expected = f"what this version of milx writes; it is of {self._origin(step)}"
+            raise ValueError(
+                f"{self.folder / str(step)}: cannot be restored, expected {expected} ({reason})"
+            ) from error
+        # Orbax pins arrays to the device that they come to, and a program compiled for free ones would compile again.
+        free = lambda like, x: jnp.asarray(np.asarray(x) if like.size else np.zeros(like.shape, like.dtype))  # noqa: E731
+        return {name: jax.tree.map(free, like[name], restored[name]) for name in like}, restored["extra"]
+
+    def replace(self, step: int, items: dict[str, Any], score: float, extra: dict[str, Any]) -> bool:
+        """Writes the checkpoint of a step again, say with the score that it lacked; a copy is kept meanwhile."""
+        copied = True
+        if parallel.is_first_host():
+            copy = self._replaced / str(step)
+            partial = copy.with_suffix(".partial")
+            try:
+                shutil.rmtree(partial, ignore_errors=True)
+                shutil.copytree(self.folder / str(step), partial)
+                partial.rename(copy)
+            except OSError as error:
+                copied = False
+                self._report(f"checkpoint of step {step} could not be written again: {error}")
+        if not parallel.on_all_hosts(copied):
+            return False
+        self._manager.delete(step)
+        written = self.save(step, items, score, extra)
+        if parallel.is_first_host():
+            self._put_back()
+        parallel.wait_for_all()
+        if not written:
+            self._manager = self._open(self.folder)
+        return written
+
+    def score(self, step: int) -> float:
+        """Of a checkpoint's validation, or UNVALIDATED."""
+        return self._manager.metrics(step)["success"]
+
+    def close(self) -> None:
+        """Ends Orbax's threads."""
+        self._manager.close()
+        if self._view:
+            self._view.cleanup()
+
+    def _origin(self, step: int) -> str:
+        """Which version of milx wrote a checkpoint, for a message."""
+        try:
+            extra = self._manager.restore(step, args=ocp.args.Composite(extra=ocp.args.JsonRestore()))["extra"]
+            return " and ".join(f"{name} {version}" for name, version in extra["versions"].items())
+        except Exception:  # it is the second thing to fail
+            return "an unknown version"
+
+    def _open(self, folder: pathlib.Path) -> ocp.CheckpointManager:
+        keep = policies.AnyPreservationPolicy(
+            [policies.LatestN(2), policies.BestN(get_metric_fn=lambda metrics: metrics["success"], n=1)]
+        )
+        options = ocp.CheckpointManagerOptions(
+            preservation_policy=keep,
+            best_fn=lambda metrics: metrics["success"],
+            create=not self._read_only,
+            read_only=self._read_only,
+        )
+        return ocp.CheckpointManager(folder, options=options)
+
+    @property
+    def _replaced(self) -> pathlib.Path:
+        """Where `replace` keeps a copy."""
+        return self.folder.parent / "replaced"
+
+    def _put_back(self) -> None:
+        """Ends what `replace` began: what is not there again is put back."""
+        for copy in self._replaced.glob("*"):
+            target = self.folder / copy.name
+            if copy.suffix or (target.is_dir() and not _damage(target)):
+                shutil.rmtree(copy)
+                continue
+            if target.is_dir():
+                _move_aside(target)
+            copy.rename(target)
+        with contextlib.suppress(OSError):  # there is none, or not for us to remove
+            self._replaced.rmdir()
+
+    def _without_damaged(self) -> pathlib.Path:
+        """A folder with the good checkpoints alone: this one, from which the damaged are moved, or one with links."""
+        if not self._read_only:
+            if parallel.is_first_host():
+                self._put_back()
+            parallel.wait_for_all()
+        steps = sorted(path for path in self.folder.glob("*") if path.name.isdigit())
+        damage = {path: problem for path in steps if (problem := _damage(path)) and path.is_dir()}
+        steps = [path for path in steps if path.is_dir()]  # a trainer may remove some while others look
+        for path, problem in damage.items():
+            self._report(f"checkpoint {path} is damaged and not used: {problem}")
+        if damage and len(damage) == len(steps):
+            raise ValueError(f"checkpoints: all in {self.folder} are damaged, expected at least one that is not")
+        if self._read_only and damage:
+            self._view = tempfile.TemporaryDirectory()
+            for path in set(steps) - set(damage):
+                (pathlib.Path(self._view.name) / path.name).symlink_to(path)
+            return pathlib.Path(self._view.name)
+        if not self._read_only:
+            parallel.wait_for_all()  # every host has looked
+            if parallel.is_first_host():
+                for path in damage:
+                    _move_aside(path)
+                for path in set(steps) - set(damage):
+                    if not (path / _CHECKSUMS).is_file():  # of an earlier version, or the process was killed just then
+                        _write_checksums(path)
+            parallel.wait_for_all()
+        return self.folder
+
+
+def _stored(x: Any) -> Any:
+    """An array as Orbax can store it, which knows none without entries."""
+    return x if np.size(x) else np.zeros(1, x.dtype)
+
+
+def _damage(checkpoint: pathlib.Path) -> str | None:
+    """What is wrong with a checkpoint's files; None if nothing is."""
+    path = checkpoint / _CHECKSUMS
+    if not (checkpoint / _METADATA).is_file():
+        return f"{_METADATA} is missing"
+    if not path.is_file():
+        return _unreadable(checkpoint)
+    try:
+        expected = dict(json.loads(path.read_text()))
+        found = _checksums(checkpoint)
+    except FileNotFoundError as error:
+        return f"{error.filename} has vanished"
+    except (ValueError, TypeError, RecursionError):
+        return f"{_CHECKSUMS} holds no checksums"
+    for name in sorted(expected):
+        if name not in found:
+            return f"{name} is missing"
+        if found[name] != expected[name]:
+            return f"{name} has changed"
+    return None if expected else f"{_CHECKSUMS} is empty"
+
+
+def _unreadable(checkpoint: pathlib.Path) -> str | None:
+    """What keeps a checkpoint without checksums from being read; None if nothing does."""
+    for path in (checkpoint / "metrics" / "metrics", checkpoint / "extra" / "metadata"):
+        try:
+            json.loads(path.read_text())
+        except (OSError, ValueError, RecursionError) as error:
+            return f"{path.relative_to(checkpoint)} cannot be read ({type(error).__name__})"
+    with contextlib.closing(ocp.StandardCheckpointer()) as reader:
+        for item in sorted(path.parent for path in checkpoint.glob("*/manifest.ocdbt")):
+            try:
+                reader.restore(item)
+            except Exception as error:  # Orbax and tensorstore have many types
+                return f"{item.name} cannot be read ({type(error).__name__})"
+    return None
+
+
+def _checksums(checkpoint: pathlib.Path) -> dict[str, str]:
+    files = sorted(path for path in checkpoint.rglob("*") if path.is_file() and _CHECKSUMS not in path.name)
+    return {str(path.relative_to(checkpoint)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+def _write_checksums(checkpoint: pathlib.Path) -> None:
+    partial = checkpoint / f"{_CHECKSUMS}.partial"
+    with partial.open("w") as file:
+        file.write(json.dumps(_checksums(checkpoint), indent=1))
+        file.flush()
+        os.fsync(file.fileno())
+    partial.replace(checkpoint / _CHECKSUMS)
+
+
+def _move_aside(checkpoint: pathlib.Path) -> None:
+    aside = checkpoint.parent.parent / "damaged"
+    aside.mkdir(exist_ok=True)
+    target, number = aside / checkpoint.name, 1
+    while target.exists():
+        target, number = aside / f"{checkpoint.name}.{number}", number + 1
+    checkpoint.rename(target)

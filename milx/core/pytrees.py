@@ -1,0 +1,82 @@
+"""Pytrees of arrays: their names, a hash of their contents, and files of them."""
+
+import hashlib
+import os
+import pathlib
+import sys
+import zipfile
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from milx.core import parallel
+
+
+def leaves(tree: Any) -> dict[str, Any]:
+    """All arrays by name, such as "states.qpos", in a fixed order."""
+    pairs, _ = jax.tree_util.tree_flatten_with_path(tree)
+    return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in pairs}
+
+
+def fingerprint(tree: Any) -> str:
+    """SHA-256 over names, types, shapes and contents of all arrays."""
+    digest = hashlib.sha256()
+    for name, leaf in leaves(tree).items():
+        array = np.ascontiguousarray(leaf)
+        digest.update(f"{name} {array.dtype} {array.shape} ".encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()
+
+
+def save(path: pathlib.Path, tree: Any) -> None:
+    """Writes a pytree as one .npz file; a file of that name is replaced only once the new one is complete."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_suffix(f".partial{os.getpid()}.npz")
+    arrays: dict[str, Any] = {name: np.asarray(leaf) for name, leaf in leaves(tree).items()}
+    np.savez_compressed(partial, **arrays)
+    partial.replace(path)
+
+
+def load(path: pathlib.Path, like: Any) -> Any:
+    """Reads a pytree written by `save`.
+
+    Args:
+        path: the .npz file.
+        like: a pytree (of arrays or shapes) with the expected names, types and shapes, say from `jax.eval_shape`.
+
+    Raises:
+        ValueError: for an array that is missing or has another type or shape; the message names it.
+    """
+    loaded = []
+    with np.load(path, allow_pickle=False) as arrays:
+        for name, expected in leaves(like).items():
+            if name not in arrays:
+                raise ValueError(f"{path}: {name}: missing, expected {expected.dtype} {expected.shape}")
+            array = arrays[name]
+            if array.shape != expected.shape or array.dtype != expected.dtype:
+                raise ValueError(
+                    f"{path}: {name}: got {array.dtype} {array.shape}, expected {expected.dtype} {expected.shape}"
+                )
+            loaded.append(jnp.asarray(array))
+    return jax.tree.unflatten(jax.tree.structure(like), loaded)
+
+
+def kept(path: pathlib.Path, make: Callable[[], Any], like: Callable[[], Any]) -> Any:
+    """What `make` returns, or returned before: it lies at `path`. A damaged file is reported and made again.
+
+    Args:
+        path: the .npz file.
+        make: makes the pytree.
+        like: the same in shapes.
+    """
+    if parallel.on_all_hosts(path.is_file()):
+        try:
+            return load(path, like())
+        except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
+            print(f"milx: {path} is damaged and made again: {error}", file=sys.stderr)
+    tree = make()
+    save(path, tree)
+    return tree

@@ -1,0 +1,244 @@
+"""Simulated demonstrations: states, actions and tasks on the device; pixels are rendered when they are needed."""
+
+import dataclasses
+import functools
+import hashlib
+import itertools
+import json
+import pathlib
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+
+from milx.config.schema import DataConfig, TrainConfig
+from milx.core import pytrees
+from milx.core.batching import map_in_chunks
+from milx.data.goals import goals
+from milx.envs.base import Env, State, Task
+from milx.trajopt import expert
+from milx.trajopt.expert import judge, perform
+from milx.trajopt.ilqr import Options
+from milx.types import SPLITS, Demo, TaskBatch
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class DemoSet:
+    """D demonstrations of each of N tasks, those that succeed before those that do not.
+
+    Attributes:
+        task: the tasks, with a leading axis [N].
+        states: with leading axes [N, D, T + 1].
+        action: [N, D, T, A].
+        success: [N, D] bool, whether the expert reached the goal.
+    """
+
+    task: Task
+    states: State
+    action: jax.Array
+    success: jax.Array
+
+    @property
+    def num_tasks(self) -> int:
+        """N."""
+        return self.action.shape[0]
+
+    @property
+    def num_demos(self) -> int:
+        """D."""
+        return self.action.shape[1]
+
+
+def collect(
+    env: Env,
+    key: jax.Array,
+    split: str,
+    num_tasks: int,
+    num_demos: int,
+    config: DataConfig,
+    parts: pathlib.Path | None = None,
+) -> DemoSet:
+    """Draws tasks of a split and plans demonstrations of each in scenes of their own.
+
+    Args:
+        env: the environment.
+        key: the set is a function of this key and the split.
+        split: "train", "validation" or "test".
+        num_tasks: N.
+        num_demos: D.
+        config: noise on the actions, and settings of the planner.
+        parts: how the names of files begin that keep what is planned at once, so that a process that was killed goes on
+            with the next; None for no files.
+    """
+    tasks, *inputs = _draw(env, jax.random.fold_in(key, SPLITS.index(split)), split, num_tasks, num_demos)
+    options, numbers = Options(iterations=config.plan_iterations), itertools.count()
+
+    def plan_part(task: Task, state: State, key: jax.Array) -> tuple[State, jax.Array]:
+        make = functools.partial(perform, env, task, state, key, options, config.noise)
+        if parts is None:
+            return make()
+        path = parts.with_name(f"{parts.name}-{next(numbers)}.npz")
+        return pytrees.kept(path, make, lambda: _of_one_task(shapes(env, 1, len(key))))
+
+    states, action = map_in_chunks(plan_part, tuple(inputs), config.plan_batch)
+    success, _ = map_in_chunks(functools.partial(judge, env), (inputs[0], states), config.plan_batch)
+    states, action, success = _without_diverged(states, action, success)
+    states, action, success = jax.tree.map(
+        lambda x: x.reshape(num_tasks, num_demos, *x.shape[1:]), (states, action, success)
+    )
+    order = jnp.argsort(~success, axis=1)
+    rows = jnp.arange(num_tasks)[:, None]
+    return DemoSet(tasks, *jax.tree.map(lambda x: x[rows, order], (states, action, success)))
+
+
+def _of_one_task(demos: DemoSet) -> tuple[State, jax.Array]:
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), (demos.states, demos.action))
+
+
+def _without_diverged(states: State, action: jax.Array, success: jax.Array) -> tuple[State, jax.Array, jax.Array]:
+    """Zeros, which count as failed, in place of what is not finite of M demonstrations; says how many there are."""
+    flat = [x.reshape(len(x), -1) for x in jax.tree.leaves((states, action)) if x.size]
+    finite = jnp.stack([jnp.isfinite(x).all(axis=1) for x in flat]).all(axis=0)
+    if diverged := int((~finite).sum()):
+        print(f"milx: {diverged} of {len(finite)} demonstrations diverged and are dropped", file=sys.stderr)
+    keep = lambda x: jnp.where(finite.reshape(-1, *[1] * (x.ndim - 1)), x, jnp.zeros((), x.dtype))  # noqa: E731
+    return *jax.tree.map(keep, (states, action)), success & finite
+
+
+@functools.partial(jax.jit, static_argnums=(0, 2, 3, 4))
+def _draw(env: Env, key: jax.Array, split: str, num_tasks: int, num_demos: int) -> tuple[Task, Task, State, jax.Array]:
+    """Tasks [N]; then, for each of the N D demonstrations, its task, the scene it starts from and a key for noise."""
+    task_key, scene_key, noise_key = jax.random.split(key, 3)
+    total = num_tasks * num_demos
+    tasks = jax.vmap(env.sample_task, in_axes=(0, None))(jax.random.split(task_key, num_tasks), split)
+    each = jax.tree.map(lambda x: jnp.repeat(x, num_demos, axis=0), tasks)
+    state = jax.vmap(env.reset)(jax.random.split(scene_key, total), each)
+    return tasks, each, state, jax.random.split(noise_key, total)
+
+
+def frame_indices(key: jax.Array, length: int, count: int | None) -> jax.Array:
+    """Draws `count` increasing time steps below `length`, one from each of equal parts, the last step always.
+
+    None draws all of them.
+    """
+    if count is None or count >= length:
+        return jnp.arange(length)
+    edges = jnp.arange(count) * (length - 1) // max(count - 1, 1)
+    offset = jax.random.uniform(key, (count - 1,)) * jnp.diff(edges)
+    return jnp.append(edges[:-1] + offset.astype(jnp.int32), length - 1)
+
+
+def render_demo(env: Env, task: Task, states: State, action: jax.Array, index: jax.Array | None = None) -> Demo:
+    """Observes one demonstration: states with a leading axis T + 1, actions [T, A].
+
+    Args:
+        env: the environment.
+        task: what the demonstration shows.
+        states: visited states.
+        action: actions taken.
+        index: [F] time steps to keep; all T if None.
+    """
+    index = jnp.arange(len(action)) if index is None else index
+    seen = jax.vmap(env.observe, in_axes=(None, 0))(task, jax.tree.map(lambda x: x[index], states))
+    robot = jax.vmap(env.robot_state)(jax.tree.map(lambda x: x[: len(action)], states))
+    goal = goals(robot, env.goal_indices, env.height_index)[index]
+    return Demo(image=seen.image, state=seen.state, action=action[index], goal=goal)
+
+
+def sample_batch(
+    env: Env,
+    demos: DemoSet,
+    keys: jax.Array,
+    shots: int,
+    support_frames: int | None = None,
+    query_frames: int | None = None,
+    redraw: bool = False,
+) -> TaskBatch:
+    """Draws tasks and different demonstrations of each that succeed, and renders them.
+
+    Args:
+        env: the environment that renders.
+        demos: where to draw from.
+        keys: [N] keys; each draws one task, with replacement.
+        shots: K, support demonstrations; one more of the same task becomes the query.
+        support_frames: time steps drawn from each support demonstration; None for all.
+        query_frames: time steps drawn from the query demonstration; None for all.
+        redraw: show a task in a new appearance of the training split, and each of its demonstrations in a new scene.
+    """
+    enough = (demos.success.sum(axis=1) > shots).astype(float)
+
+    def sample_task(key: jax.Array) -> TaskBatch:
+        task_key, demo_key, support_key, query_key = jax.random.split(key, 4)
+        n = jax.random.choice(task_key, demos.num_tasks, p=enough / enough.sum())
+        chosen = jax.random.choice(demo_key, demos.num_demos, (shots + 1,), replace=False, p=demos.success[n] / 1.0)
+        task = jax.tree.map(lambda x: x[n], demos.task)
+        if redraw:
+            task = env.redraw_appearance(jax.random.fold_in(key, 1), task)
+
+        def load(d: jax.Array, key: jax.Array, frames: int | None) -> Demo:
+            states, action = jax.tree.map(lambda x: x[n, d], (demos.states, demos.action))
+            if redraw:
+                states = env.redraw_scene(jax.random.fold_in(key, 1), task, states)
+            return render_demo(env, task, states, action, frame_indices(key, action.shape[0], frames))
+
+        support = [load(chosen[k], jax.random.fold_in(support_key, k), support_frames) for k in range(shots)]
+        query = load(chosen[shots], query_key, query_frames)
+        return TaskBatch(
+            support=jax.tree.map(lambda *xs: jnp.stack(xs), *support),
+            query=jax.tree.map(lambda x: x[None], query),
+            task=n,
+        )
+
+    return jax.vmap(sample_task)(keys)
+
+
+def sampler(env: Env, train: TrainConfig) -> Callable[[DemoSet, jax.Array], TaskBatch]:
+    """`sample_batch` as a run has it configured: a function of demonstrations and keys."""
+
+    def sample(demos: DemoSet, keys: jax.Array) -> TaskBatch:
+        frames = train.support_frames, train.query_frames
+        return sample_batch(env, demos, keys, train.shots, *frames, train.redraw)
+
+    return sample
+
+
+def shapes(env: Env, num_tasks: int, num_demos: int) -> DemoSet:
+    """Shapes and types of a set of D = `num_demos` demonstrations of each of N = `num_tasks` tasks."""
+
+    def expand(tree: Any, *axes: int) -> Any:
+        return jax.tree.map(lambda x: jax.ShapeDtypeStruct((*axes, *x.shape), x.dtype), tree)
+
+    key = jax.random.key(0)
+    task = jax.eval_shape(lambda key: env.sample_task(key, "train"), key)
+    state = jax.eval_shape(env.reset, key, task)
+    action, success = (jax.ShapeDtypeStruct(*x) for x in (((env.action_size,), state.qpos.dtype), ((), jnp.bool_)))
+    return DemoSet(
+        expand(task, num_tasks),
+        expand(state, num_tasks, num_demos, env.horizon + 1),
+        expand(action, num_tasks, num_demos, env.horizon),
+        expand(success, num_tasks, num_demos),
+    )
+
+
+def cached(
+    folder: pathlib.Path, env: Env, seed: int, split: str, num_tasks: int, num_demos: int, config: DataConfig
+) -> DemoSet:
+    """`collect`, or what it gave before: sets are kept in `folder` under a hash of all that they depend on.
+
+    The hash covers the arguments, the kind of device, and the versions of JAX, MuJoCo, the environment and the experts.
+    How many demonstrations are planned at once is left out: it changes no more than rounding.
+    """
+    request = [env.name, seed, split, num_tasks, num_demos, config.noise, config.plan_iterations, env.action_cost]
+    request += [jax.default_backend(), jax.__version__, mujoco.__version__, env.version, expert.VERSION]
+    digest = hashlib.sha256(json.dumps(request).encode()).hexdigest()[:16]
+    path = folder / f"{env.name}-{split}-{digest}.npz"
+    parts = folder / f"{path.stem}.part-{config.plan_batch}"
+    make = functools.partial(collect, env, jax.random.key(seed), split, num_tasks, num_demos, config, parts)
+    demos = pytrees.kept(path, make, lambda: shapes(env, num_tasks, num_demos))
+    for part in folder.glob(f"{parts.name}-*.npz"):
+        part.unlink(missing_ok=True)
+    return demos

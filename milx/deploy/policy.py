@@ -1,0 +1,229 @@
+"""The policy that users hold: loaded from a run, adapted to a demonstration, asked for actions."""
+
+import dataclasses
+import functools
+import json
+import pathlib
+from typing import Any
+
+import jax
+import numpy as np
+
+from milx import envs, methods
+from milx.config import schema
+from milx.config.schema import GIVEN
+from milx.core.checkpoint import Checkpoints
+from milx.data.goals import goals
+from milx.methods import Method
+from milx.types import SPEC_FILE, Demo, Memory, Observation, Params, Spec
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Policy:
+    """A trained method with its parameters.
+
+        policy = milx.load("runs/reach")
+        task_params = policy.adapt(policy.params, demo)
+        action = policy.act(task_params, observation)
+
+    Attributes:
+        method: how to adapt and act.
+        spec: the sizes of what it sees and does.
+        params: what meta-training has learnt.
+        config: the run's configuration.
+    """
+
+    method: Method
+    spec: Spec
+    params: Params
+    config: schema.Config
+
+    def adapt(self, params: Params, demo: Demo) -> Params:
+        """Learns a task from one demonstration [T, ...] or several [K, T, ...]; jitted.
+
+        Args:
+            params: `policy.params`.
+            demo: images [.., T, H, W, 3] uint8 (None for a policy that sees no pixels), states [.., T, S] and actions
+                [.., T, A], NumPy or JAX.
+
+        Returns:
+            task_params for `act`.
+
+        Raises:
+            ValueError: for a field that is missing, not wanted, or of a wrong shape or type, a value that is not
+                finite, or an action that the environment does not allow.
+        """
+        return self._adapt(params, check_demo(demo, self.spec, self.config.mil.given))
+
+    def act(self, task_params: Params, observation: Observation) -> jax.Array:
+        """The action [A], in the environment's units, for one observation; jitted.
+
+        Raises:
+            ValueError: for a field that is missing or has a wrong shape or type, or a value that is not finite; for a
+                policy that remembers.
+        """
+        if jax.tree.leaves(self.initial_memory):
+            raise ValueError("memory: missing, expected `Policy.step`: this policy remembers what it saw first")
+        return self.step(task_params, observation, self.initial_memory)[0]
+
+    def step(self, task_params: Params, observation: Observation, memory: Memory) -> tuple[jax.Array, Memory]:
+        """The action, as in `act`, and what the policy remembers for the next observation; jitted.
+
+        Args:
+            task_params: from `adapt`.
+            observation: what the policy sees.
+            memory: `initial_memory` at the first time step of an episode, and then what the step before returned.
+
+        Raises:
+            ValueError: for a field that is missing or has a wrong shape or type, or a value that is not finite.
+        """
+        return self._step(task_params, check_observation(observation, self.spec), memory)
+
+    @functools.cached_property
+    def initial_memory(self) -> Memory:
+        """What the policy remembers at the start of an episode; empty for most policies."""
+        return self.method.initial_memory(jax.random.key(0))
+
+    @functools.cached_property
+    def _adapt(self) -> Any:
+        return jax.jit(self.method.adapt)
+
+    @functools.cached_property
+    def _step(self) -> Any:
+        return jax.jit(self.method.act)
+
+
+def load(run: str | pathlib.Path) -> Policy:
+    """Loads the best policy of a run.
+
+    Args:
+        run: the run's folder, as `python -m milx.train` leaves it.
+
+    Raises:
+        ValueError: if the folder holds no run, or no checkpoint yet.
+    """
+    folder = pathlib.Path(run)
+    path = folder / "config.json"
+    if not path.is_file():
+        raise ValueError(f"run: {folder} has no config.json, expected a folder written by `python -m milx.train`")
+    config = schema.read(path)
+    if (folder / SPEC_FILE).is_file():
+        try:
+            spec = Spec.from_dict(json.loads((folder / SPEC_FILE).read_text()))
+        except (ValueError, TypeError, AttributeError, RecursionError) as error:
+            raise ValueError(f"{folder / SPEC_FILE}: expected the sizes of a policy: {error}") from error
+    else:
+        spec = envs.make(config.env_name, config.env.image_shape, config.env.action_cost).spec
+    method = methods.make(config, spec)
+    checkpoints = Checkpoints(folder / "checkpoints", read_only=True)
+    if checkpoints.best is None:
+        raise ValueError(f"run: {folder} has no checkpoint yet")
+    items, _ = checkpoints.restore(checkpoints.best, {"params": methods.params_like(method, spec)})
+    return Policy(method, spec, items["params"], config)
+
+
+def check_demo(demo: Demo, spec: Spec, given: str = GIVEN[0]) -> Demo:
+    """Checks demonstrations, leaves out what is not `given`, adds their goals, and gives them their leading axis K.
+
+    Raises:
+        ValueError: naming the field, what came and what was expected.
+    """
+    if not isinstance(demo, Demo):
+        raise ValueError(f"demo: got {type(demo).__name__}, expected a milx.Demo")
+    leading = {"video+state+action": "action", "video+state": "state", "video": "image"}[given]
+    axes = {"action": ("A",), "state": ("S",), "image": ("H", "W", "3")}[leading]
+    first = _as_array(f"demo.{leading}", getattr(demo, leading))
+    lead = first.ndim - len(axes) - 1
+    if lead not in (0, 1) or 0 in first.shape:
+        size = ", ".join(axes)
+        expected = f"[T, {size}] or [K, T, {size}] with at least one time step"
+        raise ValueError(f"demo.{leading}: got shape {list(first.shape)}, expected {expected}")
+    shape = first.shape[: lead + 1]
+    checked = Demo(_check_image("demo.image", demo.image, shape, spec))
+    if given != "video":
+        state = _check_state("demo.state", demo.state, shape, spec)
+        checked = dataclasses.replace(checked, state=state)
+    if given == "video+state+action":
+        checked = dataclasses.replace(checked, action=_check_action(demo.action, shape, spec))
+    if not lead:
+        checked = jax.tree.map(lambda x: x[None], checked)
+    return with_goals(checked, spec)
+
+
+def with_goals(demo: Demo, spec: Spec) -> Demo:
+    """Demonstrations [K, T, ...] with their goals, if their states tell them."""
+    if demo.state is None or not spec.goal_indices:
+        return demo
+    goal = jax.vmap(lambda state: goals(state, spec.goal_indices, spec.height_index))(demo.state)
+    return dataclasses.replace(demo, goal=goal)
+
+
+def _check_action(value: Any, shape: tuple[int, ...], spec: Spec) -> np.ndarray:
+    action = _check_vector("demo.action", value, (*shape, spec.action_size))
+    if spec.action_range is None:
+        return action
+    low, high = spec.action_range
+    if outside := np.argwhere((action < low) | (action > high)).tolist():
+        index = tuple(outside[0])
+        limits = f"at least {low[index[-1]]} and at most {high[index[-1]]}"
+        raise ValueError(f"demo.action: got {action[index]} at {index}, expected {limits}")
+    return action
+
+
+def check_observation(observation: Observation, spec: Spec) -> Observation:
+    """Checks one observation.
+
+    Raises:
+        ValueError: naming the field, what came and what was expected.
+    """
+    if not isinstance(observation, Observation):
+        raise ValueError(f"observation: got {type(observation).__name__}, expected a milx.Observation")
+    return Observation(
+        image=_check_image("observation.image", observation.image, (), spec),
+        state=_check_state("observation.state", observation.state, (), spec),
+    )
+
+
+def _as_array(field: str, value: Any) -> Any:
+    if value is None:
+        raise ValueError(f"{field}: missing, expected an array")
+    try:
+        return value if isinstance(value, jax.Array) else np.asarray(value)
+    except ValueError as error:
+        raise ValueError(f"{field}: got {type(value).__name__}, expected an array ({error})") from error
+
+
+def _check_image(field: str, value: Any, lead: tuple[int, ...], spec: Spec) -> jax.Array | np.ndarray | None:
+    if spec.image_shape is None:
+        if value is not None:
+            raise ValueError(f"{field}: got {type(value).__name__}, expected None: this policy sees no pixels")
+        return None
+    array = _check_shape(field, value, (*lead, *spec.image_shape, 3))
+    if array.dtype != np.uint8:
+        raise ValueError(f"{field}: got {array.dtype}, expected uint8 in [0, 255]")
+    return array
+
+
+def _check_state(field: str, value: Any, lead: tuple[int, ...], spec: Spec) -> np.ndarray:
+    """The state; where there are no states, none is asked for."""
+    if value is None and not spec.state_size:
+        return np.zeros((*lead, 0), np.float32)
+    return _check_vector(field, value, (*lead, spec.state_size))
+
+
+def _check_vector(field: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
+    array = _check_shape(field, value, shape)
+    if array.dtype.kind not in "fiu":
+        raise ValueError(f"{field}: got {array.dtype}, expected real numbers")
+    array = np.asarray(array, np.float32)
+    if not np.isfinite(array).all():
+        index = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
+        raise ValueError(f"{field}: got {array[index]} at {index}, expected finite numbers")
+    return array
+
+
+def _check_shape(field: str, value: Any, shape: tuple[int, ...]) -> Any:
+    array = _as_array(field, value)
+    if array.shape != shape:
+        raise ValueError(f"{field}: got shape {list(array.shape)}, expected {list(shape)}")
+    return array

@@ -1,0 +1,59 @@
+"""Policies that ship with milx: `milx.load("push")`."""
+
+import json
+import pathlib
+from typing import Any
+
+from milx import envs, methods
+from milx.config import schema
+from milx.core import pytrees
+from milx.deploy import policy
+from milx.deploy.policy import Policy
+from milx.methods import params_like
+
+FOLDER = pathlib.Path(__file__).parent / "weights"
+
+
+def names() -> list[str]:
+    """The policies that there are."""
+    return sorted(path.parent.name for path in FOLDER.glob("*/params.npz"))
+
+
+def result(name: str) -> dict[str, Any]:
+    """What one of them reached: the evaluation.json of its run, and `pytrees.fingerprint` of the parameters."""
+    return json.loads((FOLDER / name / "result.json").read_text())
+
+
+def load(run: str | pathlib.Path) -> Policy:
+    """Loads the best policy of a run, or one that ships with milx.
+
+    Args:
+        run: the run's folder, as `python -m milx.train` leaves it, or a name.
+
+    Raises:
+        ValueError: for neither, or a run that has no checkpoint yet.
+    """
+    is_run = (pathlib.Path(run) / "config.json").is_file()
+    if is_run or (pathlib.Path(run).exists() and run not in names()):
+        return policy.load(run)
+    if run not in names():
+        expected = f"the folder of a run, or one of {', '.join(names())}, which ship with milx"
+        raise ValueError(f"run: got {str(run)!r}, expected {expected}")
+    config = schema.from_dict(result(str(run))["config"])
+    spec = envs.make(config.env_name, config.env.image_shape, config.env.action_cost).spec
+    method = methods.make(config, spec)
+    params = pytrees.load(FOLDER / run / "params.npz", like=params_like(method, spec))
+    return Policy(method, spec, params, config)
+
+
+def save(trained: Policy, reached: dict[str, Any], folder: pathlib.Path) -> None:
+    """Writes a policy as `load` reads it.
+
+    Args:
+        trained: the policy of a run in an environment.
+        reached: the run's evaluation.json, configuration included.
+        folder: where to.
+    """
+    pytrees.save(folder / "params.npz", trained.params)
+    digest = pytrees.fingerprint(trained.params)
+    (folder / "result.json").write_text(json.dumps(reached | {"params_hash": digest}, indent=1) + "\n")

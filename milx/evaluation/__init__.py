@@ -1,0 +1,1 @@
+"""How good a policy is, and the files and plots that say so."""

@@ -1,0 +1,246 @@
+"""Closed-loop evaluation on held-out tasks, with floors and a ceiling beside the result.
+
+One adaptation per task, on a demonstration whose own scene is never a trial scene; then trials in fresh scenes.
+"""
+
+import dataclasses
+import functools
+import math
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from milx.config.schema import Config, DataConfig, EvalConfig
+from milx.core import parallel
+from milx.core.batching import map_in_chunks, map_in_groups
+from milx.data.simulated import DemoSet, render_demo, shapes
+from milx.envs.base import Env, State, Task
+from milx.evaluation import listening
+from milx.evaluation.intervals import bootstrap_interval, wilson_interval
+from milx.evaluation.rollout import rollout
+from milx.methods.base import Method
+from milx.methods.random import Random
+from milx.trajopt.expert import judge, perform
+from milx.trajopt.ilqr import Options
+from milx.types import Demo, Params, TaskBatch
+
+_LISTENERS = 24
+"""Held-out tasks on which `listen` measures, at most."""
+_PIXELS = 64_000_000
+"""Pixels of demonstrations that a device adapts to at once: an inner step keeps all activations for its gradient."""
+
+
+@functools.partial(jax.jit, static_argnums=(0, 3))
+def trial_scenes(env: Env, task: Task, key: jax.Array, trials: int) -> State:
+    """Draws the scenes of every task's trials: `task` has a leading axis [N], the result [N, trials]."""
+    num_tasks = len(jax.tree.leaves(task)[0])
+    keys = jax.random.split(key, (num_tasks, trials))
+    return jax.vmap(jax.vmap(env.reset, in_axes=(0, None)))(keys, task)
+
+
+class Trials(NamedTuple):
+    """What became of the trials of N tasks.
+
+    Attributes:
+        success: [N, trials] bool.
+        other: the same by the environment's other criteria.
+        states: visited states, with leading axes [N, trials, T + 1].
+    """
+
+    success: jax.Array
+    other: dict[str, jax.Array]
+    states: State
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _run_batch(
+    env: Env,
+    method: Method,
+    params: Params,
+    task: Task,
+    shown: Task,
+    states: State,
+    action: jax.Array,
+    scene: State,
+    key: jax.Array,
+) -> Trials:
+    """Adapts to demonstrations [N, K, T, ...] of tasks `shown`, then lets the policy act from scenes [N, trials]."""
+
+    def run_tasks(
+        params: Params, task: Task, shown: Task, states: State, action: jax.Array, scene: State, key: jax.Array
+    ) -> Trials:
+        def adapt(task: Task, states: State, action: jax.Array) -> Params:
+            return method.adapt(params, jax.vmap(functools.partial(render_demo, env, task))(states, action))
+
+        def trial(task_params: Params, task: Task, scene: State, key: jax.Array) -> Trials:
+            visited, _ = rollout(env, method, task_params, task, scene, key)
+            return Trials(env.success(task, visited), env.other_criteria(task, visited), visited)
+
+        task_params = map_in_groups(adapt, (shown, states, action), _tasks_at_once(env, action))
+        return jax.vmap(jax.vmap(trial, in_axes=(None, None, 0, 0)))(task_params, task, scene, key)
+
+    return parallel.split_tasks(run_tasks, shared=1)(params, task, shown, states, action, scene, key)
+
+
+def _tasks_at_once(env: Env, action: jax.Array) -> int:
+    """Of tasks with demonstrations [N, K, T, A]."""
+    shots, length = action.shape[1:3]
+    return _PIXELS // (shots * length * math.prod(env.image_shape)) if env.vision else len(action)
+
+
+def run_trials(
+    env: Env,
+    method: Method,
+    params: Params,
+    demos: DemoSet,
+    config: EvalConfig,
+    key: jax.Array,
+    misled: bool = False,
+) -> Trials:
+    """Runs every trial of every task in `demos`.
+
+    Args:
+        env: the environment.
+        method: what adapts and acts.
+        params: what it has learnt.
+        demos: held-out tasks; the policy adapts to the first `config.shots` demonstrations of each.
+        config: trials, shots and batch.
+        key: draws the trial scenes.
+        misled: show each task's policy the next task's demonstrations instead, and judge it by its own task.
+    """
+    scene_key, act_key = jax.random.split(key)
+    scene = trial_scenes(env, demos.task, scene_key, config.trials)
+    shown = jax.tree.map(lambda x: jnp.roll(x, -1, axis=0), demos) if misled else demos
+    support = jax.tree.map(lambda x: x[:, : config.shots], (shown.states, shown.action))
+    keys = jax.random.split(act_key, (demos.num_tasks, config.trials))
+    inputs = (demos.task, shown.task, *support, scene, keys)
+    return map_in_chunks(functools.partial(_run_batch, env, method, params), inputs, config.batch)
+
+
+def precompile(env: Env, method: Method, params: Params, config: EvalConfig) -> None:
+    """Compiles what `run_trials` runs, into the compilation cache; `params` may be shapes."""
+    size = parallel.round_up(config.batch)
+    batch = shapes(env, size, config.shots)
+    keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), (size, config.trials)))
+    scene = jax.eval_shape(lambda task: trial_scenes(env, task, jax.random.key(0), config.trials), batch.task)
+    shown = batch.task, batch.states, batch.action
+    _run_batch.lower(env, method, params, batch.task, *shown, scene, keys).compile()
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1, 4))
+def _listen(env: Env, method: Method, params: Params, demos: DemoSet, shots: int) -> dict[str, jax.Array]:
+    def render(task: Task, states: State, action: jax.Array) -> Demo:
+        return jax.vmap(functools.partial(render_demo, env, task))(states, action)
+
+    shown = parallel.split_tasks(jax.vmap(render))(demos.task, demos.states, demos.action)
+    batch = TaskBatch(jax.tree.map(lambda x: x[:, :shots], shown), jax.tree.map(lambda x: x[:, shots:], shown))
+    return listening.measure(method, params, batch, _tasks_at_once(env, demos.action[:, :shots]))
+
+
+def listen(env: Env, method: Method, params: Params, demos: DemoSet, shots: int) -> dict[str, float]:
+    """What `listening.measure` finds on held-out tasks: adapted to `shots` demonstrations, asked for the next one's.
+
+    Nothing where there are fewer than two tasks, or fewer tasks than devices.
+    """
+    count = min(demos.num_tasks, _LISTENERS) // parallel.num_devices() * parallel.num_devices()
+    if count < 2:
+        return {}
+    chosen = jax.tree.map(lambda x: x[:count], demos)
+    states = jax.tree.map(lambda x: x[:, : shots + 1], chosen.states)
+    chosen = dataclasses.replace(chosen, states=states, action=chosen.action[:, : shots + 1])
+    return {name: float(value) for name, value in _listen(env, method, params, chosen, shots).items()}
+
+
+class Floors(NamedTuple):
+    """Success rates of "random" actions, the "task_blind" expert, and the "expert".
+
+    `describe` adds the policy's own with another task's demonstration, "other_demo".
+
+    Attributes:
+        success: by name.
+        other: the same by the environment's other criteria.
+    """
+
+    success: dict[str, float]
+    other: dict[str, dict[str, float]]
+
+
+def baselines(env: Env, demos: DemoSet, config: EvalConfig, expert: DataConfig, key: jax.Array) -> Floors:
+    """What random actions, the task-blind expert and the expert reach in the same trials.
+
+    They run in the first `config.baseline_trials` of every task's trials. The task-blind expert goes to a random
+    candidate; the expert does without noise what it planned or rehearsed.
+    """
+    num_trials = min(config.baseline_trials, config.trials)
+    scene = trial_scenes(env, demos.task, jax.random.split(key)[0], config.trials)
+    total = demos.num_tasks * num_trials  # said, as arrays without entries do not tell
+    scene = jax.tree.map(lambda x: x[:, :num_trials].reshape(total, *x.shape[2:]), scene)
+    task = jax.tree.map(lambda x: jnp.repeat(x, num_trials, axis=0), demos.task)
+    keys = jax.random.split(jax.random.fold_in(key, 1), total)
+
+    # Both experts plan for the task as they believe it to be, and both are judged by the task as it is.
+    believed = jax.vmap(env.task_blind)(keys, task), task
+    twice = [jax.tree.map(lambda *xs: jnp.concatenate(xs), *pair) for pair in (believed, (scene, scene), (keys, keys))]
+    options = Options(iterations=expert.plan_iterations)
+    plan = functools.partial(perform, env, options=options, noise=0.0)
+    states, _ = map_in_chunks(plan, tuple(twice), expert.plan_batch)
+    as_it_is = jax.tree.map(lambda x: jnp.concatenate([x, x]), task)
+    success, other = map_in_chunks(functools.partial(judge, env), (as_it_is, states), expert.plan_batch)
+    random = run_trials(env, Random(env.action_size), (), demos, config, key)
+
+    def rates(of_experts: jax.Array, of_random: jax.Array) -> dict[str, float]:
+        halves = of_experts.reshape(2, total).mean(axis=1)
+        return {
+            "random": float(of_random[:, :num_trials].mean()),
+            "task_blind": float(halves[0]),
+            "expert": float(halves[1]),
+        }
+
+    return Floors(rates(success, random.success), {name: rates(other[name], random.other[name]) for name in other})
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def film(camera: Env, task: Task, states: State) -> jax.Array:
+    """Images [N, F, H, W, 3] uint8 of episodes of N tasks: `states` has leading axes [N, T + 1].
+
+    `camera` is the environment with the wanted image size.
+    """
+    return jax.vmap(camera.film)(task, states)
+
+
+def describe(env: Env, config: Config, task: Task, trials: Trials, misled: Trials, floors: Floors) -> dict[str, Any]:
+    """What the result file of a run says of its evaluation: what was asked and what came out, by every criterion.
+
+    Args:
+        env: the environment.
+        config: of the run.
+        task: [N] what was tried.
+        trials: after adaptation to each task's own demonstrations.
+        misled: after adaptation to another task's, judged by the own task.
+        floors: what stands beside the results.
+    """
+    kind = np.asarray(jax.vmap(env.target_kind)(task))
+    kind = np.where(kind < 0, np.arange(len(kind)), kind)
+
+    def judged(success: jax.Array, floors: dict[str, float], misled: jax.Array) -> dict[str, Any]:
+        successes, trials = int(success.sum()), int(success.size)
+        return {
+            "success": successes / trials,
+            "wilson95": list(wilson_interval(successes, trials)),
+            "bootstrap95": list(bootstrap_interval(np.asarray(success), kind)),
+            "baselines": {**floors, "other_demo": float(misled.mean())},
+        }
+
+    other = {name: judged(success, floors.other[name], misled.other[name]) for name, success in trials.other.items()}
+    return {
+        "num_tasks_train": config.data.tasks,
+        "num_demos_train": config.data.tasks * config.data.demos_per_task,
+        "shots": config.evaluation.shots,
+        "given": config.mil.given if env.vision else config.mil.given.removeprefix("video+"),
+        "trials": int(trials.success.size),
+        **judged(trials.success, floors.success, misled.success),
+        "criterion": env.criterion,
+        **({"other_criteria": other} if other else {}),
+    }

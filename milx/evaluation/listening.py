@@ -1,0 +1,104 @@
+"""Whether a policy listens to the demonstration: errors of its actions with the right one, another one and none.
+
+The loss after the inner step falls far below the loss before it even where nothing of the task is transferred: any
+demonstration tells how actions are distributed. What tells whether a policy listens is the difference between its own
+task's demonstration and another task's.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+
+from milx.core import parallel, pytrees
+from milx.core.batching import map_in_groups
+from milx.evaluation.rollout import replay
+from milx.methods.base import Method
+from milx.methods.whitening import MIN_STD
+from milx.types import Demo, Params, TaskBatch
+
+MARGIN = 0.05
+"""A policy listens if another task's demonstration makes its error larger by more than this part."""
+ERRORS = {"own_demo": "its own", "other_demo": "another task's", "no_demo": "no"}
+"""The errors that `measure` finds, by whose demonstration the policy saw."""
+_SMALLEST = 1e-3
+
+
+def measure(method: Method, params: Params, batch: TaskBatch, most: int | None = None) -> dict[str, jax.Array]:
+    """Errors of the actions on the queries of N tasks, and the size of the step; to be called inside `jax.jit`.
+
+    Errors are squared, and divided by the variance of the queries' actions (entry by entry, at least MIN_STD squared,
+    then averaged): 1 is what the best constant action has. On reach_state, which has three tasks, the other task is the
+    same in a third of cases.
+
+    Args:
+        method: what adapts and acts.
+        params: what it has learnt.
+        batch: N tasks, of which neighbours should differ.
+        most: tasks that a device adapts to at once; all if None.
+
+    Returns:
+        "own_demo", "other_demo" (with two tasks or more) and, where a policy can act without a demonstration,
+        "no_demo": the errors after adaptation to the task's demonstration, to that of the next task in the batch, and
+        before. There, too, "step/<name>" for every tensor of the policy: the root mean square of its change, divided by
+        that of the tensor (or by 1e-3 where that is smaller), averaged over the tasks.
+    """
+    most = most or len(batch.query.action)
+
+    def adapt(params: Params, support: Demo) -> Params:
+        return map_in_groups(functools.partial(method.adapt, params), (support,), most)
+
+    def error(task_params: Params, query: Demo) -> jax.Array:
+        return map_in_groups(functools.partial(_squared_error, method), (task_params, query), most)
+
+    def error_before(prior: Params, query: Demo) -> jax.Array:
+        return map_in_groups(functools.partial(_squared_error, method, prior), (query,), most)
+
+    adapted = parallel.split_tasks(adapt, shared=1)(params, batch.support)
+    on_each = parallel.split_tasks(error)
+    errors = {"own_demo": on_each(adapted, batch.query)}
+    if len(batch.query.action) > 1:
+        of_next = jax.tree.map(lambda x: jnp.roll(x, -1, axis=0), adapted)
+        errors["other_demo"] = on_each(of_next, batch.query)
+    prior = method.unadapted(params)
+    if prior is not None:
+        errors["no_demo"] = parallel.split_tasks(error_before, shared=1)(prior, batch.query)
+    action = batch.query.action
+    variance = jnp.maximum(jnp.var(action.reshape(-1, action.shape[-1]), axis=0), MIN_STD**2)
+    found = {name: (value.mean(axis=0) / variance).mean() for name, value in errors.items()}
+    return found if prior is None else found | _steps(prior, adapted)
+
+
+def is_deaf(found: dict[str, float]) -> bool:
+    """Whether the errors of `measure` say that the demonstration makes no difference."""
+    return "other_demo" in found and found["other_demo"] <= (1 + MARGIN) * found["own_demo"]
+
+
+def advice(has_inner_step: bool) -> str:
+    """What a run says that does not listen, and what to try."""
+    remedies = "more tasks in a meta-batch (train.meta_batch), or whitened actions (mil.whiten_actions)"
+    if has_inner_step:
+        remedies = f"imitation before the first inner step (train.imitation_steps), another mil.inner_lr, {remedies}"
+    return f"the policy does not listen: another task's demonstration does as well as its own. Try {remedies}"
+
+
+def describe(found: dict[str, float]) -> str:
+    """The errors of `measure` for people, to be put behind something else."""
+    parts = [f"{found[name]:.2f} with {words}" for name, words in ERRORS.items() if name in found]
+    return f"; error of the actions {', '.join(parts)} demonstration" if parts else ""
+
+
+def _squared_error(method: Method, task_params: Params, query: Demo) -> jax.Array:
+    """[A] mean over the time steps of demonstrations [Q, T, ...]."""
+    action = jax.vmap(functools.partial(replay, method, task_params))(query)
+    return jnp.square(action - query.action).mean(axis=(0, 1))
+
+
+def _steps(before: Params, after: Params) -> dict[str, jax.Array]:
+    def size(x: jax.Array) -> jax.Array:
+        return jnp.sqrt(jnp.square(x).mean())
+
+    moved = jax.tree.map(lambda x, y: jax.vmap(lambda y: size(y - x))(y).mean(), before, after)
+    tensors, changes = pytrees.leaves(before), pytrees.leaves(moved)
+    learnt = {name: x for name, x in tensors.items() if x.size and not name.startswith("whitening.")}
+    return {f"step/{name}": changes[name] / jnp.maximum(size(x), _SMALLEST) for name, x in learnt.items()}

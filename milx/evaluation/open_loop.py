@@ -1,0 +1,54 @@
+"""How good a policy is where there is no simulator: its actions on recorded observations of held-out tasks."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+
+from milx.data.recorded import Recorded
+from milx.evaluation.rollout import replay
+from milx.methods import Method
+from milx.types import Demo, Params
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def task_errors(
+    method: Method,
+    shots: int,
+    params: Params,
+    queries: Recorded,
+    support: Demo,
+    other: Demo | None,
+    mean: jax.Array,
+    scale: jax.Array,
+) -> dict[str, jax.Array]:
+    """Mean squared errors of the actions on a task's queries, in units of `scale`.
+
+    Args:
+        method: what adapts and acts.
+        shots: K.
+        params: what it has learnt.
+        queries: [D, T, ...] demonstrations to predict the actions of.
+        support: [K, T, ...] demonstrations to adapt to.
+        other: demonstrations of another task; None for none.
+        mean: [A] the training tasks' mean action.
+        scale: [A] their standard deviation.
+
+    Returns:
+        "after" adaptation; "before", if the method can act without; after adaptation to the "other_task"; and of the
+        "mean_action".
+    """
+    weight = queries.acts / queries.acts.sum()
+
+    def error(action: jax.Array) -> jax.Array:
+        return (jnp.square((action - queries.demo.action) / scale).mean(axis=(1, 2)) * weight).sum()
+
+    def act(task_params: Params) -> jax.Array:
+        return jax.lax.map(functools.partial(replay, method, task_params), queries.demo)
+
+    errors = {"after": error(act(method.adapt(params, support))), "mean_action": error(mean)}
+    if (prior := method.unadapted(params)) is not None:
+        errors["before"] = error(act(prior))
+    if other is not None:
+        errors["other_task"] = error(act(method.adapt(params, other)))
+    return errors

@@ -1,0 +1,53 @@
+"""Result files: one JSON object for a run or a cell, with the same fields in all experiments."""
+
+import json
+import os
+import pathlib
+from typing import Any
+
+from milx.config import presets, schema
+from milx.config.schema import Config
+from milx.evaluation import provenance
+
+
+def describe(
+    config: Config, found: dict[str, Any], seconds: dict[str, float], step: int, dataset_hash: str
+) -> dict[str, Any]:
+    """A result as its JSON file holds it: what was run, what came out, what it took, and where.
+
+    Args:
+        config: what was run.
+        found: what the evaluation says (`evaluator.describe`).
+        seconds: wall-clock by part.
+        step: meta-updates of the checkpoint that was evaluated.
+        dataset_hash: `fingerprint` of the training demonstrations.
+    """
+    return {
+        "env": config.env_name,
+        "method": config.method_name,
+        "preset": config.preset,
+        "variant": ", ".join(f"{name}={value}" for name, value in presets.overrides(config).items()),
+        "seed": config.seed,
+        **found,
+        "wall_clock_s": seconds,
+        "steps": step,
+        "config": schema.to_dict(config),
+        "dataset_hash": dataset_hash,
+        **provenance.describe(),
+    }
+
+
+def intervals(runs: list[dict[str, Any]]) -> list[tuple[float, float]]:
+    """The 95% intervals of the success in result files, all of one kind.
+
+    They are over held-out things ("bootstrap95") if every file has them, else over trials ("wilson95").
+    """
+    kind = "bootstrap95" if all("bootstrap95" in run for run in runs) else "wilson95"
+    return [(run[kind][0], run[kind][1]) for run in runs]
+
+
+def write_json(path: pathlib.Path, values: dict[str, Any]) -> None:
+    """Writes a file as a whole: a process that is killed leaves the old one or the new one."""
+    partial = path.with_suffix(f".partial{os.getpid()}")
+    partial.write_text(json.dumps(values, indent=1) + "\n")
+    partial.replace(path)

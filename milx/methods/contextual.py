@@ -1,0 +1,76 @@
+"""Contextual and recurrent policies: a demonstration becomes a context, and no parameter changes (paper, Section 6)."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from milx.config.schema import MILConfig
+from milx.methods.base import Method
+from milx.methods.imitation import behavioural_cloning, calibrate_goal_head, flat, shown
+from milx.methods.whitening import Whitening
+from milx.networks.encoders import ContextNetwork
+from milx.types import Demo, Memory, Observation, Params, TaskBatch
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ContextPolicy(Method):
+    """Imitates the query, told by the context of the support demonstration.
+
+    `params` holds the network's parameters ("encoder", "actor") and the whitening. `task_params` holds the actor's, the
+    whitening and the contexts of K demonstrations; with several the actions are averaged, as in the released code.
+
+    Attributes:
+        config: scale and weight of the losses.
+        network: encoder and actor.
+        goal_indices, image_to_goal: as in `MIL`.
+    """
+
+    config: MILConfig
+    network: ContextNetwork
+    goal_indices: tuple[int, ...] = ()
+    image_to_goal: tuple[tuple[float, ...], ...] | None = None
+
+    def init(self, key: jax.Array, whitening: Whitening) -> Params:
+        """Draws the networks' parameters."""
+        params = self.network.init(key)
+        actor = calibrate_goal_head(params["actor"], self.image_to_goal, self.goal_indices, whitening)
+        return {**params, "actor": actor, "whitening": whitening}
+
+    def adapt(self, params: Params, demo: Demo) -> Params:
+        """Encodes demonstrations [K, T, ...]."""
+        whitening = jax.lax.stop_gradient(params["whitening"])
+        demo = shown(demo, self.config.given, whitening)
+
+        def encode(image: jax.Array | None, state: jax.Array, action: jax.Array) -> Any:
+            return self.network.encode(params, image, whitening.state(state), whitening.action(action))
+
+        context = jax.vmap(encode)(demo.image, demo.state, demo.action)
+        return {"actor": params["actor"], "whitening": params["whitening"], "context": context}
+
+    def loss(
+        self, params: Params, batch: TaskBatch, progress: jax.Array | float = 1.0
+    ) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """Imitation of the queries, averaged over the tasks and the support demonstrations; and its parts, [N]."""
+
+        def task_loss(support: Demo, query: Demo) -> tuple[jax.Array, dict[str, jax.Array]]:
+            task_params = self.adapt(params, support)
+            whitening = jax.lax.stop_gradient(params["whitening"])
+            seen = flat(query)
+
+            def one(context: Any) -> tuple[jax.Array, dict[str, jax.Array]]:
+                output = self.network.apply(task_params, context, seen.image, whitening.state(seen.state))
+                return behavioural_cloning(self.config, output, output.action, query, whitening, self.goal_indices)
+
+            return jax.tree.map(jnp.mean, jax.vmap(one)(task_params["context"]))
+
+        loss, metrics = jax.vmap(task_loss)(batch.support, batch.query)
+        return loss.mean(), {"loss": loss, **metrics}
+
+    def act(self, task_params: Params, observation: Observation, memory: Memory) -> tuple[jax.Array, Memory]:
+        """The mean over the contexts of the actor's action."""
+        whitening, batch = task_params["whitening"], jax.tree.map(lambda x: x[None], observation)
+        state = whitening.state(batch.state)
+        apply = jax.vmap(lambda context: self.network.apply(task_params, context, batch.image, state).action[0])
+        return whitening.unwhiten_action(apply(task_params["context"]).mean(axis=0)), memory

@@ -1,0 +1,226 @@
+"""Meta-imitation learning: MAML through a step of behavioural cloning (paper, Section 4).
+
+For a task with demonstrations d (support) and d' (query) of the same goal in different scenes,
+
+    theta' = theta - alpha * clip(grad_theta L(theta, d))        the inner step, eq. 1
+    minimise over theta:  sum over tasks of L(theta', d')        the meta-objective, eq. 3
+
+with the behavioural cloning loss L(theta, d) = mean over t of |m (a_t - pi_theta(o_t))|^2, eq. 2. Where d shows no
+actions the inner step descends a learned loss instead, whose parameters are part of theta. `jax.grad` goes through the
+inner step, `vmap` over the tasks.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from milx.config.schema import MILConfig
+from milx.methods.base import Method
+from milx.methods.imitation import behavioural_cloning, calibrate_goal_head, flat, goal_loss, head_losses, shown
+from milx.methods.whitening import Whitening
+from milx.networks.goal import Goal
+from milx.networks.policy_network import BIAS_TRANSFORMATION, PolicyNetwork, PolicyOutput
+from milx.types import Demo, Memory, Observation, Params, TaskBatch
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
+def gradient(loss: Callable[..., jax.Array], theta: Params, *data: Any) -> Params:
+    """The gradient of loss(theta, *data), once more differentiable in theta (in reverse); `data` counts as constant.
+
+    Its derivative is a product of the Hessian with a vector. As the Hessian is symmetric (`loss` must not stop the
+    gradient of a part of theta in one place and use it in another), the product may be taken forward over reverse,
+    which keeps no intermediate results of the inner gradient for the meta-gradient (Pearlmutter 1994), where reverse
+    over reverse keeps them all.
+    """
+    return jax.grad(loss)(theta, *data)
+
+
+def _gradient_forward(loss: Callable[..., jax.Array], theta: Params, *data: Any) -> tuple[Params, tuple]:
+    return jax.grad(loss)(theta, *data), (theta, *data)
+
+
+def _gradient_backward(loss: Callable[..., jax.Array], inputs: tuple, vector: Params) -> tuple:
+    theta, *data = inputs
+    _, product = jax.jvp(lambda theta: jax.grad(loss)(theta, *data), (theta,), (vector,))
+    return product, *(None for _ in data)
+
+
+gradient.defvjp(_gradient_forward, _gradient_backward)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class MIL(Method):
+    """Meta-imitation learning with one or two heads.
+
+    `params` holds the network's parameters ("policy"), the whitening, which no gradient reaches, and, if the inner
+    learning rate is learned, the logarithm of its factor for every tensor ("inner_log_lr"). `task_params` holds the
+    adapted network's parameters and the whitening.
+
+    Attributes:
+        config: inner steps and losses.
+        network: the policy network.
+        goal_indices: entries of the state that the goal head predicts.
+        image_to_goal: [3, G] from (x, y, 1), x and y in [-1, 1] across and down the image, to those entries, to start
+            the goal heads from; None without one, or if they must learn that by themselves.
+    """
+
+    config: MILConfig
+    network: PolicyNetwork
+    goal_indices: tuple[int, ...] = ()
+    image_to_goal: tuple[tuple[float, ...], ...] | None = None
+
+    def init(self, key: jax.Array, whitening: Whitening) -> Params:
+        """Draws the network's parameters."""
+        theta = self.network.init(key)
+        theta = calibrate_goal_head(theta, self.image_to_goal, self.goal_indices, whitening)
+        params = {"policy": theta, "whitening": whitening}
+        if self.config.learn_inner_lr:
+            params["inner_log_lr"] = jax.tree.map(lambda _: jnp.zeros(()), params["policy"])
+        return params
+
+    def adapt(self, params: Params, demo: Demo) -> Params:
+        """Takes the inner gradient steps (eq. 1) on demonstrations [K, T, ...]: their gradients are averaged."""
+        return {"policy": self._steps(params, demo)[-1], "whitening": params["whitening"]}
+
+    def _steps(self, params: Params, demo: Demo) -> list[Params]:
+        """The network's parameters before the inner steps and after each of them."""
+        theta, demo = params["policy"], shown(demo, self.config.given, params["whitening"])
+        demo = self._with_goal_in_hindsight(params, demo)
+        rates = jax.tree.map(lambda _: self.config.inner_lr, theta)
+        if self.config.learn_inner_lr:
+            rates = jax.tree.map(lambda s: self.config.inner_lr * jnp.exp(s), params["inner_log_lr"])
+        adapts, clip, thetas = self._adapted(theta), self.config.inner_clip, [theta]
+
+        def step(p: jax.Array, g: jax.Array, rate: jax.Array | float, adapts: bool) -> jax.Array:
+            return p - rate * jnp.clip(g, -clip, clip) if adapts else p
+
+        for _ in range(self.config.inner_steps):
+            grad = gradient(self._inner_loss, theta, params["whitening"], demo)
+            if self.config.first_order:
+                grad = jax.lax.stop_gradient(grad)
+            theta = jax.tree.map(step, theta, grad, rates, adapts)
+            thetas.append(theta)
+        return thetas
+
+    def _adapted(self, theta: Params) -> Params:
+        """Which tensors the inner step changes, a bool for each."""
+
+        def adapts(path: tuple, _: jax.Array) -> bool:
+            names = {entry.key for entry in path}
+            is_last = "controller" in names and not names.isdisjoint(self.network.output_layers)
+            return {"anil": is_last, "boil": not is_last, "cavia": BIAS_TRANSFORMATION in names}.get(
+                self.config.variant, True
+            )
+
+        return jax.tree_util.tree_map_with_path(adapts, theta)
+
+    def unadapted(self, params: Params) -> Params:
+        """The parameters from which every task is learnt."""
+        return {"policy": params["policy"], "whitening": params["whitening"]}
+
+    def loss(
+        self, params: Params, batch: TaskBatch, progress: jax.Array | float = 1.0
+    ) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """The meta-objective (eq. 3), averaged over the tasks; and its parts, [N] of each task.
+
+        With the variant "multi_step" it is sum over i = 1..n of w_i L(theta_i, d'), theta_i being the parameters after
+        i of the n inner steps: w_i = (1 - progress) / n for i < n, and w_n is what they leave of 1 (Antoniou et al.
+        2019, Section 4). A hindsight head learns from the queries beside it, unadapted, as the inner step uses it.
+        """
+
+        def task_loss(support: Demo, query: Demo) -> tuple[jax.Array, dict[str, jax.Array]]:
+            *earlier, adapted = self._steps(params, support)
+            loss, metrics = self._query_loss(params, adapted, query)
+            if self.config.variant == "multi_step":
+                losses = [self._query_loss(params, theta, query)[0] for theta in earlier[1:]]
+                weight = (1 - progress) / self.config.inner_steps
+                loss = (1 - weight * len(losses)) * loss + weight * sum(losses)
+            return loss, metrics
+
+        loss, metrics = jax.vmap(task_loss)(batch.support, batch.query)
+        return loss.mean(), {"loss": loss, **metrics}
+
+    def imitation(self, params: Params, batch: TaskBatch) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """L(theta, d) + L(theta, d'), without an inner step: d through the head of the inner loss, if it shows actions.
+
+        The policy learns what all tasks share, so that the first inner gradients point at what is special about one.
+        """
+
+        def task_loss(support: Demo, query: Demo) -> tuple[jax.Array, dict[str, jax.Array]]:
+            loss, metrics = self._query_loss(params, params["policy"], query)
+            if self.network.learned_loss is None:
+                loss += self._inner_loss(params["policy"], params["whitening"], support)
+            return loss, metrics
+
+        loss, metrics = jax.vmap(task_loss)(batch.support, batch.query)
+        return loss.mean(), {"loss": loss, **metrics}
+
+    def _query_loss(self, params: Params, theta: Params, query: Demo) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """What parameters theta of the network lose on a task's queries, and the parts of it."""
+        loss, metrics = self.imitation_loss(theta, params["whitening"], query)
+        if self.network.hindsight is not None and query.goal is not None:
+            whitening = jax.lax.stop_gradient(params["whitening"])
+            told = self._in_hindsight(params["policy"], whitening, query)
+            metrics["hindsight_loss"] = goal_loss(told, query.goal[:, :1], whitening, self.goal_indices)
+            loss += self.config.goal_weight * metrics["hindsight_loss"]
+        return loss, metrics
+
+    def act(self, task_params: Params, observation: Observation, memory: Memory) -> tuple[jax.Array, Memory]:
+        """The adapted network's action for one observation. The memory is what a target head saw in the first one."""
+        whitening, batch = task_params["whitening"], jax.tree.map(lambda x: x[None], observation)
+        target = memory[None] if self.network.has_target else None
+        output = self.network.apply(task_params["policy"], batch.image, whitening.state(batch.state), 1, target)
+        action = whitening.unwhiten_action(output.action[0])
+        return action, memory if output.target is None else output.target[0]
+
+    def initial_memory(self, key: jax.Array) -> Memory:
+        """Nothing; for a target head the target [G], not known yet (NaN)."""
+        return jnp.full(len(self.goal_indices), jnp.nan) if self.network.has_target else ()
+
+    def _inner_loss(self, theta: Params, whitening: Whitening, demo: Demo) -> jax.Array:
+        if self.network.learned_loss is None:
+            return self.imitation_loss(theta, whitening, demo, inner=True)[0]
+        output = self._apply(theta, whitening, demo)
+        loss = self.network.learned_loss(theta, output.features.reshape(*demo.state.shape[:2], -1)).mean()
+        return loss + self.config.goal_weight * sum(head_losses(output, demo, whitening, self.goal_indices).values())
+
+    def _with_goal_in_hindsight(self, params: Params, demo: Demo) -> Demo:
+        """Video alone gets a goal for its first image, as if given: the hindsight head's.
+
+        In training it is the first image that was drawn (`train.support_frames`), which may show the hand on its way.
+        """
+        if self.network.hindsight is None:
+            return demo
+        whitening, indices = params["whitening"], jnp.array(self.goal_indices, int)
+        goal = self._in_hindsight(params["policy"], whitening, demo).mean
+        goal = whitening.state_mean[indices] + whitening.state_scale[indices] * goal
+        unknown = jnp.full((*demo.state.shape[:2], len(indices)), jnp.nan)
+        return dataclasses.replace(demo, goal=unknown.at[:, 0].set(goal))
+
+    def _in_hindsight(self, theta: Params, whitening: Whitening, demo: Demo) -> Goal:
+        """Where the robot went in each of the demonstrations [K, T, ...], by their first and last images."""
+        ends = jax.tree.map(lambda x: x[:, jnp.array([0, -1])], demo)
+        maps = self._apply(theta, whitening, ends).feature_map
+        assert self.network.hindsight is not None and maps is not None
+        return self.network.hindsight(theta, maps.reshape(len(demo.state), 2, *maps.shape[1:]))
+
+    def _apply(self, theta: Params, whitening: Whitening, demo: Demo) -> PolicyOutput:
+        """What the network says of all time steps of demonstrations [K, T, ...], one after the other."""
+        seen = flat(demo)
+        return self.network.apply(theta, seen.image, whitening.state(seen.state), demo.state.shape[1])
+
+    def imitation_loss(
+        self, theta: Params, whitening: Whitening, demo: Demo, inner: bool = False
+    ) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """Behavioural cloning (eq. 2) on demonstrations [K, T, ...], plus the goal head's error where there is one.
+
+        `inner` selects the head of the inner loss. Returns the sum and its parts.
+        """
+        whitening = jax.lax.stop_gradient(whitening)
+        output = self._apply(theta, whitening, demo)
+        action = output.inner_action if inner else output.action
+        return behavioural_cloning(self.config, output, action, demo, whitening, self.goal_indices)

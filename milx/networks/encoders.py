@@ -1,0 +1,124 @@
+"""Policies that turn a demonstration into a vector once, and see that vector while they act (paper, Section 6).
+
+*Contextual*: the vector comes from the demonstration's last frame. *LSTM*: a recurrent network reads frames from the
+first to the last, with states and actions. The network that acts is the same for both, and MIL's but for the vector.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from milx.config.schema import NetworkConfig
+from milx.networks.goal import StateGoalHead
+from milx.networks.layers import Dense
+from milx.networks.policy_network import Controller, ConvStack, PolicyOutput
+from milx.types import Params
+
+
+class ContextNetwork(NamedTuple):
+    """The networks as pure functions.
+
+    Attributes:
+        init: key -> params.
+        encode: (params, image [T, H, W, 3] uint8 or None, whitened state [T, S], whitened action [T, A]) -> context, a
+            pytree: what is kept of a demonstration.
+        apply: (params, context, image [B, H, W, 3] uint8 or None, whitened state [B, S]) -> PolicyOutput.
+    """
+
+    init: Callable[[jax.Array], Params]
+    encode: Callable[..., Any]
+    apply: Callable[..., PolicyOutput]
+
+
+class LastFrame(nn.Module):
+    """The context [D] of a demonstration's last image and state."""
+
+    config: NetworkConfig
+
+    @nn.compact
+    def __call__(self, image: jax.Array | None, state: jax.Array, action: jax.Array) -> jax.Array:
+        """See `ContextNetwork.encode`; the actions are not looked at."""
+        last = state[-1:]
+        if image is not None:
+            features = ConvStack(self.config, name="vision")(image[-1:], state.dtype)
+            last = jnp.concatenate([features.reshape(1, -1), last], axis=-1)
+        return Dense(self.config.context, hidden=True, norm=self.config.fc_norm)(last)[0]
+
+
+class Recurrent(nn.Module):
+    """The context [D] is an LSTM's output after the last frame (Hochreiter and Schmidhuber 1997).
+
+    It reads `config.context_frames` of them, spread evenly from the first to the last.
+    """
+
+    config: NetworkConfig
+
+    @nn.compact
+    def __call__(self, image: jax.Array | None, state: jax.Array, action: jax.Array) -> jax.Array:
+        """See `ContextNetwork.encode`."""
+        index = np.linspace(0, len(state) - 1, min(len(state), self.config.context_frames)).round().astype(int)
+        parts = [state[index], action[index]]
+        if image is not None:
+            features = ConvStack(self.config, name="vision")(image[index], state.dtype)
+            flat = features.reshape(len(features), -1)
+            parts.append(Dense(self.config.fc_layers[0], hidden=True, norm=self.config.fc_norm)(flat))
+        cell = nn.OptimizedLSTMCell(self.config.context, param_dtype=state.dtype)
+        return nn.RNN(cell, name="lstm")(jnp.concatenate(parts, axis=-1))[-1]
+
+
+class Actor(nn.Module):
+    """The policy that sees the context; its goal head looks for what the context asks for."""
+
+    config: NetworkConfig
+    action_size: int
+    goal_size: int
+
+    @nn.compact
+    def __call__(self, context: jax.Array, image: jax.Array | None, state: jax.Array) -> PolicyOutput:
+        """See `ContextNetwork.apply`."""
+        features = query = None
+        if image is not None:
+            features = ConvStack(self.config, name="vision")(image, state.dtype)
+        if self.config.goal_head:
+            size = StateGoalHead.candidates if features is None else features.shape[-1]
+            query = jnp.broadcast_to(Dense(size)(context), (len(state), size))
+        controller = Controller(self.config, self.action_size, self.goal_size, name="controller")
+        return controller(features, state, jnp.broadcast_to(context, (len(state), *context.shape)), query)
+
+
+def make_context_network(
+    encoder: nn.Module, actor: nn.Module, image_shape: tuple[int, int] | None, state_size: int, action_size: int
+) -> ContextNetwork:
+    """Joins an encoder and an actor.
+
+    Args:
+        encoder: maps demonstrations to contexts.
+        actor: maps contexts and observations to actions.
+        image_shape: (H, W); None where the policy sees no pixels.
+        state_size: S.
+        action_size: A.
+    """
+
+    def init(key: jax.Array) -> Params:
+        image = None if image_shape is None else jnp.zeros((1, *image_shape, 3), jnp.uint8)
+        state, action = jnp.zeros((1, state_size)), jnp.zeros((1, action_size))
+        encoder_key, actor_key = jax.random.split(key)
+        context, encoding = encoder.init_with_output(encoder_key, image, state, action)
+        return {
+            "encoder": encoding["params"],
+            "actor": actor.init(actor_key, context, image, state)["params"],
+        }
+
+    def encode(params: Params, image: jax.Array | None, state: jax.Array, action: jax.Array) -> Any:
+        return encoder.apply({"params": params["encoder"]}, image, state, action)
+
+    def apply(params: Params, context: Any, image: jax.Array | None, state: jax.Array) -> PolicyOutput:
+        output = actor.apply({"params": params["actor"]}, context, image, state)
+        assert isinstance(output, PolicyOutput)
+        return output
+
+    return ContextNetwork(init, encode, apply)

@@ -1,0 +1,217 @@
+"""The policy network of the paper: convolutions, then fully connected layers that also see the robot's state."""
+
+import functools
+from collections.abc import Callable
+from typing import NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from milx.config.schema import NetworkConfig
+from milx.networks.goal import Goal, GoalHead, HindsightHead, StateGoalHead
+from milx.networks.layers import ConvBlock, Dense, FixedConv, SpatialSoftArgmax
+from milx.networks.learned_loss import LearnedLoss
+from milx.types import Params
+
+BIAS_TRANSFORMATION = "bias_transformation"
+"""The parameter that joins the input of the first fully connected layer."""
+
+
+class PolicyOutput(NamedTuple):
+    """What the network says of a batch of observations.
+
+    Attributes:
+        action: [B, A] of the head that acts, in the network's units.
+        inner_action: [B, A] of the head that the inner loss sees; the same head if there is only one.
+        goal: where the episode will end; None without a goal head.
+        feature_map: [B, H, W, C] what the convolutions make of the image; None where the policy sees no pixels.
+        features: [B, F] what the last layer sees in the inner loss.
+        target: [B, G] whitened, as a target head has it; None without one.
+    """
+
+    action: jax.Array
+    inner_action: jax.Array
+    goal: Goal | None
+    feature_map: jax.Array | None
+    features: jax.Array
+    target: jax.Array | None = None
+
+
+class PolicyNetwork(NamedTuple):
+    """The network as pure functions.
+
+    Attributes:
+        init: key -> params.
+        apply: (params, image [B, H, W, 3] uint8 or None, whitened state [B, S]) -> PolicyOutput. For a target head it
+            takes two more: `length`, as many consecutive images as show one episode, whose first tells the target of
+            all; and `target` [B, G], where it is known already, NaN where it is not.
+        learned_loss: (params, features [K, T, F]) -> [K], the loss of demonstrations without actions; None without one.
+        hindsight: (params, feature maps of videos [K, T, H, W, C]) -> Goal, where the robot went in each; None without
+            such a head.
+        output_layers: names of the parameters of the last layer of each head.
+        has_target: whether there is a target head.
+    """
+
+    init: Callable[[jax.Array], Params]
+    apply: Callable[..., PolicyOutput]
+    learned_loss: Callable[[Params, jax.Array], jax.Array] | None = None
+    hindsight: Callable[[Params, jax.Array], Goal] | None = None
+    output_layers: tuple[str, ...] = ()
+    has_target: bool = False
+
+
+class ConvStack(nn.Module):
+    """All convolutions: images [B, H, W, 3] uint8 to a feature map [B, H', W', C] of the parameters' type."""
+
+    config: NetworkConfig
+
+    @nn.compact
+    def __call__(self, image: jax.Array, dtype: jnp.dtype) -> jax.Array:
+        """`dtype` is that of the parameters."""
+        config = self.config
+        x = image.astype(dtype) / 255.0
+        block = nn.remat(ConvBlock) if config.rematerialise else ConvBlock
+        for i, (filters, stride) in enumerate(zip(config.filters, config.strides, strict=True)):
+            layer = FixedConv if i == 0 and config.fixed_filters else block
+            x = layer(filters, config.kernel, stride, config.mixed_precision, name=f"ConvBlock_{i}")(x)
+        return x.astype(dtype)
+
+
+class Controller(nn.Module):
+    """From a feature map and the robot's state to an action.
+
+    Attributes:
+        config: layers and heads.
+        action_size: A.
+        goal_size: G; 0 for no goal head whatever `config` says.
+    """
+
+    config: NetworkConfig
+    action_size: int
+    goal_size: int
+
+    @nn.compact
+    def __call__(
+        self,
+        features: jax.Array | None,
+        state: jax.Array,
+        context: jax.Array,
+        query: jax.Array | None = None,
+        length: int = 1,
+        target: jax.Array | None = None,
+    ) -> PolicyOutput:
+        """Acts.
+
+        Args:
+            features: [B, H, W, C]; None where the policy sees no pixels.
+            state: [B, S] whitened.
+            context: [B, D], joins the input of the first fully connected layer.
+            query: [B, C] or, without features, [B, candidates]: tells the goal head what to look for; None for nothing.
+            length: as many consecutive rows are one episode, see `PolicyNetwork.apply`.
+            target: [B, G] for a target head, see there; None if it is not known at all.
+        """
+        config, goal, seen_target = self.config, None, None
+        parts, has_goal = [state, context], config.goal_head and self.goal_size
+        if features is not None:
+            seen = SpatialSoftArgmax()(features) if config.soft_argmax else features.reshape(len(features), -1)
+            parts = [seen, *parts]
+            if config.target_head and self.goal_size:
+                first = jnp.repeat(seen[::length], length, axis=0)
+                seen_target = Dense(self.goal_size, name="target_head")(first)
+                if target is not None:
+                    seen_target = jnp.where(jnp.isnan(target), seen_target, target)
+                parts.append(seen_target)
+        if has_goal:
+            head, on = (StateGoalHead, state) if features is None else (GoalHead, features)
+            goal = head(self.goal_size, name="goal_head")(on, query)
+            parts.append(goal.mean)
+        seen = jnp.concatenate(parts, axis=-1)
+        hidden = functools.partial(Dense, hidden=True, norm=config.fc_norm, init_std=config.fc_init_std)
+        layers = [hidden(size) for size in config.fc_layers]
+        heads = [Dense(self.action_size, init_std=config.fc_init_std) for _ in range(config.heads)]
+        x = inner = _through(layers, seen)
+        if config.inner_first_layer:
+            inner = _through([hidden(config.fc_layers[0], name="inner_first"), *layers[1:]], seen)
+        return PolicyOutput(heads[-1](x), heads[0](inner), goal, features, inner, seen_target)
+
+
+def _through(layers: list[Dense], x: jax.Array) -> jax.Array:
+    return functools.reduce(lambda x, layer: layer(x), layers, x)
+
+
+class _Policy(nn.Module):
+    config: NetworkConfig
+    action_size: int
+    goal_size: int
+
+    @nn.compact
+    def __call__(
+        self, image: jax.Array | None, state: jax.Array, length: int = 1, target: jax.Array | None = None
+    ) -> PolicyOutput:
+        # A learned constant joins the input of the first layer: its gradient gives the layer's bias a step of its own
+        # (the paper's bias transformation, Section 4.1).
+        size = self.config.bias_transformation
+        z = self.param(BIAS_TRANSFORMATION, nn.initializers.zeros, (size,))
+        features = None if image is None else ConvStack(self.config, name="vision")(image, state.dtype)
+        controller = Controller(self.config, self.action_size, self.goal_size, name="controller")
+        return controller(features, state, jnp.broadcast_to(z, (len(state), size)), None, length, target)
+
+
+def make_policy(
+    config: NetworkConfig, image_shape: tuple[int, int] | None, state_size: int, action_size: int, goal_size: int
+) -> PolicyNetwork:
+    """Builds the policy network.
+
+    Args:
+        config: layers and heads.
+        image_shape: (H, W); None where the policy sees no pixels.
+        state_size: S.
+        action_size: A.
+        goal_size: G, entries of the state that the goal head predicts.
+    """
+    module = _Policy(config, action_size, goal_size)
+    image = None if image_shape is None else jnp.zeros((1, *image_shape, 3), jnp.uint8)
+
+    loss, head = LearnedLoss(config.learned_loss or "linear"), HindsightHead(goal_size)
+
+    def init(key: jax.Array) -> Params:
+        output, variables = module.init_with_output(key, image, jnp.zeros((1, state_size)))
+        params = variables["params"]
+        if config.learned_loss is not None:
+            start = loss.init(jax.random.fold_in(key, 1), output.features[None])
+            params = {**params, "learned_loss": start["params"]}
+        if config.hindsight_head:
+            start = head.init(jax.random.fold_in(key, 2), output.feature_map[None])
+            params = {**params, "hindsight": start["params"]}
+        return params
+
+    def apply(
+        params: Params,
+        image: jax.Array | None,
+        state: jax.Array,
+        length: int = 1,
+        target: jax.Array | None = None,
+    ) -> PolicyOutput:
+        output = module.apply({"params": params}, image, state, length, target)
+        assert isinstance(output, PolicyOutput)
+        return output
+
+    def learned_loss(params: Params, features: jax.Array) -> jax.Array:
+        value = loss.apply({"params": params["learned_loss"]}, features)
+        assert isinstance(value, jax.Array)
+        return value
+
+    def hindsight(params: Params, feature_maps: jax.Array) -> Goal:
+        goal = head.apply({"params": params["hindsight"]}, feature_maps)
+        assert isinstance(goal, Goal)
+        return goal
+
+    return PolicyNetwork(
+        init,
+        apply,
+        None if config.learned_loss is None else learned_loss,
+        hindsight if config.hindsight_head else None,
+        tuple(f"Dense_{len(config.fc_layers) + i}" for i in range(config.heads)),
+        bool(config.target_head and goal_size and image_shape),
+    )

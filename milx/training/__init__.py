@@ -1,0 +1,1 @@
+"""Meta-training: updates, runs, and what keeps them safe."""

@@ -1,0 +1,225 @@
+"""Runs on recorded demonstrations: no simulator, so a policy is judged by the actions that it predicts.
+
+Its score is how much closer its actions come, after adaptation, to those of a held-out task's other demonstrations than
+the mean action of the training tasks does: 1 minus the ratio of the squared errors.
+"""
+
+import functools
+import pathlib
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from rich.console import Console
+
+from milx.config import presets
+from milx.config.check import check_config
+from milx.config.schema import GIVEN, Config
+from milx.data.dataset import DataSet, spread
+from milx.data.recorded import MOST_DEMOS, Recorded, Shards, load, sample_batch, with_goals
+from milx.evaluation import plots, results
+from milx.evaluation.open_loop import task_errors
+from milx.methods import whitening
+from milx.training.metrics import read_metrics
+from milx.training.run import Run
+from milx.training.state import Training
+from milx.types import SPEC_FILE, Demo, Params, Spec, TaskBatch
+
+RECORDED = "recorded"
+"""The value of `config.env_name` that stands for recorded demonstrations."""
+
+
+def make_config(path: str | pathlib.Path, method: str = "mil", preset: str = "fast", seed: int = 0) -> Config:
+    """The configuration of a preset for a data set: its image size, and no convolutions where there are no images.
+
+    Raises:
+        ValueError: for a path that holds no data set, or a preset that does not exist.
+    """
+    config, head = presets.make_config(RECORDED, method, preset, seed), DataSet(path).header
+    config.recorded.path = str(pathlib.Path(path).resolve())
+    if head.image_shape is None:
+        config.network.filters = config.network.strides = ()
+        config.network.soft_argmax = config.network.mixed_precision = False
+    else:
+        config.env.image_shape = head.image_shape
+    return config
+
+
+def spec_of(data: DataSet, config: Config) -> Spec:
+    """The sizes of what a policy sees and does on a data set."""
+    head = data.header
+    return Spec(head.image_shape, head.state_size, head.action_size, None, tuple(config.recorded.goal_indices))
+
+
+class Statistics(NamedTuple):
+    """States [F, S] of all time steps of some tasks, and actions [F', A] of those that show them."""
+
+    state: np.ndarray
+    action: np.ndarray
+
+
+def read_vectors(data: DataSet, tasks: list[int], horizon: int) -> Statistics:
+    """All states and actions of these tasks, resampled to the horizon."""
+    states, actions = [], []
+    for task in tasks:
+        info = data.header.tasks[task]
+        for number, length in enumerate(info.lengths):
+            demo = data.read(task, number, spread(length, horizon), fields=("state", "action"))
+            for field, value in (("state", demo.state), ("action", demo.action)):
+                if value is not None and not np.isfinite(value).all():
+                    where = f"demonstration {number} of task {task} ({info.name!r})"
+                    raise ValueError(f"data: {field} of {where}: got values that are not finite, expected finite ones")
+            states.append(np.zeros((horizon, 0), np.float32) if demo.state is None else demo.state)
+            if demo.action is not None:
+                actions.append(demo.action)
+    return Statistics(np.concatenate(states), np.concatenate(actions))
+
+
+class RecordedRun(Run):
+    """A run on the data set `config.recorded.path`.
+
+    Args:
+        config: what to run.
+        workdir: the folder; made if missing.
+        console: where to report progress.
+
+    Raises:
+        ValueError: as `Run`; for a path that holds no data set; if no training task has enough demonstrations.
+    """
+
+    metric = "score"
+
+    def __init__(self, config: Config, workdir: str | pathlib.Path, console: Console | None = None):
+        check_config(config)
+        self.data = DataSet(config.recorded.path)
+        settings, train = config.recorded, config.train
+        if settings.horizon < 1:
+            raise ValueError(f"recorded.horizon: got {settings.horizon}, expected at least 1")
+        if bad := [i for i in settings.goal_indices if not 0 <= i < self.data.header.state_size]:
+            raise ValueError(f"recorded.goal_indices: got {bad[0]}, expected less than {self.data.header.state_size}")
+        self.given_action = config.mil.given == GIVEN[0]
+        for field, shots in (("train", train.shots), ("evaluation", config.evaluation.shots)):
+            if shots >= MOST_DEMOS:
+                raise ValueError(f"{field}.shots: got {shots}, expected less than {MOST_DEMOS}")
+        for split in ("validation", "test"):
+            if not any(self._enough(i, config.evaluation.shots) for i in self.data.header.of_split(split)):
+                least = f"more than evaluation.shots = {config.evaluation.shots} demonstrations"
+                raise ValueError(
+                    f"data: {config.recorded.path} has no {split} task with {least}, expected at least one"
+                )
+        tasks = [i for i in self.data.header.of_split("train") if self._enough(i, train.shots)]
+        if not tasks:
+            expected = (
+                f"at least one with more than train.shots = {train.shots} demonstrations, of which one shows actions"
+            )
+            raise ValueError(f"data: {config.recorded.path} has no such training task, expected {expected}")
+        self.shards = Shards(self.data, tasks, settings.horizon, settings.gib, config.seed, train.shots + 1)
+
+        def sample(recorded: Recorded, keys: jax.Array) -> TaskBatch:
+            frames = train.support_frames, train.query_frames
+            return sample_batch(recorded, keys, train.shots, *frames, self.given_action, tuple(settings.goal_indices))
+
+        spec = spec_of(self.data, config)
+        super().__init__(config, spec, sample, 0, workdir, console)
+        results.write_json(self.folder / SPEC_FILE, spec.to_dict())
+
+    def _enough(self, task: int, shots: int) -> bool:
+        info = self.data.header.tasks[task]
+        support = sum(info.has_action) if self.given_action else len(info.lengths)
+        return any(info.has_action) and support > shots
+
+    @functools.cached_property
+    def _vectors(self) -> Statistics:
+        return read_vectors(self.data, self.shards.tasks, self.config.recorded.horizon)
+
+    def _load(self) -> Training:
+        with self._clock("demos"), self.console.status("reading demonstrations"):
+            state, action = self._vectors
+            statistics = whitening.fit(jnp.asarray(state), jnp.asarray(action), self.config.mil.whiten_actions)
+            dataset_hash = self.data.fingerprint()
+            held_out = [i for split in ("validation", "test") for i in self.data.header.of_split(split)]
+            read_vectors(self.data, held_out, self.config.recorded.horizon)  # refuses what is not finite
+        count = sum(len(self.data.header.tasks[i].lengths) for i in self.shards.tasks)
+        self.console.print(f"{count} demonstrations of {len(self.shards.tasks)} training tasks")
+        at = lambda step: self.shards.at(step // self.config.train.log_every)  # noqa: E731
+        return Training(dataset_hash, statistics, at, self._first_images)
+
+    def _first_images(self) -> np.ndarray:
+        first = [self.data.read(task, 0, np.zeros(1, int), fields=("image",)).image for task in self.shards.tasks[:128]]
+        return np.concatenate(first)
+
+    def _shapes(self) -> Recorded:
+        return self.shards.shapes
+
+    def _validate(self, params: Params) -> tuple[float, dict[str, float]]:
+        errors = self._errors(params, "validation")
+        names = {"own_demo": "after", "other_demo": "other_task", "no_demo": "before"}
+        heard = {name: errors[key] / errors["mean_action"] for name, key in names.items() if key in errors}
+        return 1 - heard["own_demo"], heard
+
+    def _judge(self, params: Params) -> tuple[dict[str, Any], Callable[[dict[str, Any]], None]]:
+        with self._clock("evaluate"):
+            errors = self._errors(params, "test")
+        training = self.shards.tasks
+        found = {
+            "num_tasks_train": len(training),
+            "num_demos_train": sum(len(self.data.header.tasks[i].lengths) for i in training),
+            "shots": self.config.evaluation.shots,
+            "given": self.config.mil.given,
+            "score": 1 - errors["after"] / errors["mean_action"],
+            "criterion": "squared error of the actions of held-out tasks' other demonstrations, in standard deviations",
+            "action_error": errors,
+        }
+        metrics = self.folder / "metrics.jsonl"
+        draw = lambda result: plots.action_errors(  # noqa: E731
+            read_metrics(metrics), result, self.folder / "learning_curve.png"
+        )
+        return found, draw
+
+    def report(self, result: dict[str, Any]) -> None:
+        """Prints the errors of the actions."""
+        errors = result["action_error"]
+        names = {"before": "before adaptation", "other_task": "adapted to another task", "mean_action": "mean action"}
+        floors = ", ".join(f"{label} {errors[name]:.3f}" for name, label in names.items() if name in errors)
+        self.console.print(
+            f"[bold]{errors['after']:.3f}[/bold] +- {errors['standard_error']:.3f} is the squared error of the actions "
+            f"on {errors['tasks']} held-out tasks after adaptation ({floors}). See {self.folder}"
+        )
+
+    def _errors(self, params: Params, split: str) -> dict[str, float]:
+        """Mean squared errors over the tasks of a split, in standard deviations of the actions."""
+        shots = self.config.evaluation.shots
+        tasks = [i for i in self.data.header.of_split(split) if self._enough(i, shots)]
+        action = self._vectors.action
+        mean, scale = action.mean(axis=0), np.maximum(action.std(axis=0), whitening.MIN_STD)
+        found, previous = [], None
+        for task in tasks:
+            recorded, support = self._task(task, shots)
+            errors = task_errors(self.method, shots, params, recorded, support, previous, mean, scale)
+            found.append({name: float(error) for name, error in errors.items()})
+            previous = support
+        names = set.union(*(set(errors) for errors in found))
+        means = {name: float(np.mean([errors[name] for errors in found if name in errors])) for name in sorted(names)}
+        after = np.array([errors["after"] for errors in found])
+        return {
+            **means,
+            "standard_error": float(after.std(ddof=1) / len(after) ** 0.5) if len(after) > 1 else 0.0,
+            "tasks": len(tasks),
+        }
+
+    def _task(self, task: int, shots: int) -> tuple[Recorded, Demo]:
+        """A task's queries [D, T, ...], and its first `shots` demonstrations that may be shown as the support."""
+        info, horizon = self.data.header.tasks[task], self.config.recorded.horizon
+        # Those without actions first, where they will do: the others are to be asked.
+        numbers = sorted(range(len(info.lengths)), key=lambda i: info.has_action[i] and not self.given_action)
+        shown = [i for i in numbers if info.has_action[i] or not self.given_action][:shots]
+        asked = [i for i in numbers if info.has_action[i] and i not in shown][: MOST_DEMOS - shots]
+        recorded = jax.tree.map(lambda x: x[0], load(self.data, [task], [[*shown, *asked]], horizon))
+        support = jax.tree.map(lambda x: x[:shots], recorded.demo)
+        fill = MOST_DEMOS - len(shown) - len(asked)
+        rest = lambda x: np.pad(x[shots:], [(0, fill)] + [(0, 0)] * (x.ndim - 1))  # noqa: E731
+        queries = Recorded(recorded.number, *jax.tree.map(rest, (recorded.demo, recorded.there, recorded.acts)))
+        indices = tuple(self.config.recorded.goal_indices)
+        return queries, jax.vmap(lambda demo: with_goals(demo, indices))(support)

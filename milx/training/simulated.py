@@ -1,0 +1,176 @@
+"""Runs in a simulated environment: planned demonstrations, and success in closed-loop trials on held-out tasks.
+
+A run's folder then holds a video, too: rollouts.gif.
+"""
+
+import functools
+import pathlib
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+from rich.console import Console
+
+from milx import envs
+from milx.config.check import check_config
+from milx.config.schema import Config, EvalConfig
+from milx.core import platform, pytrees
+from milx.data import simulated as demos_lib
+from milx.data.simulated import DemoSet
+from milx.envs.base import State
+from milx.evaluation import closed_loop, plots
+from milx.evaluation.closed_loop import Trials
+from milx.methods import Method, whitening
+from milx.methods.random import Random
+from milx.training.metrics import read_metrics
+from milx.training.run import Run
+from milx.training.state import Training
+from milx.types import SPLITS, Params
+
+EVALUATION_SEED = 2017
+"""Validation and test tasks and their trials are the same for every seed of a run."""
+
+
+def split_demos(env: envs.Env, config: Config, split: str) -> DemoSet:
+    """The demonstrations of a split as a run uses them, planned or from the cache of earlier runs."""
+    num_tasks, num_demos = {
+        "train": (config.data.tasks, config.data.demos_per_task),
+        "validation": (config.evaluation.validation_tasks, config.evaluation.shots + max(config.data.spare_demos, 1)),
+        "test": (config.evaluation.tasks, config.evaluation.shots + config.data.spare_demos),
+    }[split]
+    seed = config.seed if split == "train" else EVALUATION_SEED
+    folder = platform.cache_folder() / "demos"
+    return demos_lib.cached(folder, env, seed, split, num_tasks, num_demos, config.data)
+
+
+def trial_key(split: str) -> jax.Array:
+    """Draws the trial scenes of a split."""
+    return jax.random.fold_in(jax.random.key(EVALUATION_SEED), len(SPLITS) + SPLITS.index(split))
+
+
+def training_on(env: envs.Env, config: Config, train: DemoSet) -> Training:
+    """A run's view of planned demonstrations.
+
+    Raises:
+        ValueError: if no task has enough successful demonstrations for support and query.
+    """
+    most, shots = int(train.success.sum(axis=1).max()), config.train.shots
+    if most <= shots:
+        raise ValueError(f"data: at most {most} demonstrations of a task succeed, expected more than {shots}")
+    statistics = whitening.fit(_robot_states(env, train.states), train.action, config.mil.whiten_actions)
+
+    def first_images() -> np.ndarray:
+        task, states = jax.tree.map(lambda x: x[:128], (train.task, train.states))
+        return np.asarray(jax.jit(jax.vmap(env.render))(task, jax.tree.map(lambda x: x[:, 0, 0], states)))
+
+    return Training(pytrees.fingerprint(train), statistics, lambda _: train, first_images)
+
+
+def validation_of(
+    env: envs.Env, method: Method, params: Params, demos: DemoSet, config: EvalConfig
+) -> tuple[float, dict[str, float]]:
+    """Success in the trials of the validation tasks, and what `listening.measure` finds there."""
+    trials = closed_loop.run_trials(env, method, params, demos, config, trial_key("validation"))
+    return float(trials.success.mean()), closed_loop.listen(env, method, params, demos, config.shots)
+
+
+def result_of(
+    env: envs.Env, method: Method, params: Params, demos: DemoSet, config: Config, floors: closed_loop.Floors
+) -> tuple[Trials, dict[str, Any]]:
+    """The trials of the test tasks, and what the result file says of them."""
+    trials = closed_loop.run_trials(env, method, params, demos, config.evaluation, trial_key("test"))
+    misled = closed_loop.run_trials(env, method, params, demos, config.evaluation, trial_key("test"), misled=True)
+    return trials, closed_loop.describe(env, config, demos.task, trials, misled, floors)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _robot_states(env: envs.Env, states: State) -> jax.Array:
+    return jax.vmap(jax.vmap(jax.vmap(env.robot_state)))(states)
+
+
+class SimulatedRun(Run):
+    """A run in the environment that `config.env_name` names.
+
+    Args:
+        config: what to run.
+        workdir: the folder; made if missing.
+        console: where to report progress.
+
+    Raises:
+        ValueError: as `Run`, and if no demonstration is left to be the query.
+    """
+
+    metric = "success"
+
+    def __init__(self, config: Config, workdir: str | pathlib.Path, console: Console | None = None):
+        check_config(config)
+        if config.data.demos_per_task <= config.train.shots:
+            expected = f"more than train.shots = {config.train.shots}: another one is the query"
+            raise ValueError(f"data.demos_per_task: got {config.data.demos_per_task}, expected {expected}")
+        self.env = envs.make(config.env_name, config.env.image_shape, config.env.action_cost)
+        self._demonstrations: dict[str, dict[str, float]] = {}
+        sample = demos_lib.sampler(self.env, config.train)
+        super().__init__(config, self.env.spec, sample, self.env.chain, workdir, console)
+
+    def demos(self, split: str) -> DemoSet:
+        """The demonstrations of a split, planned or from the cache of earlier runs."""
+        with self._clock("demos"), self.console.status(f"planning {split} demonstrations"):
+            demos = split_demos(self.env, self.config, split)
+        count, success = demos.success.size, float(demos.success.mean())
+        self._demonstrations[split] = {"count": count, "success": success}
+        self.console.print(f"{count} {split} demonstrations, of which {success:.1%} succeed")
+        return demos
+
+    def report(self, result: dict[str, Any]) -> None:
+        """Prints success, interval, floors and ceiling."""
+        low, high = result["wilson95"]
+        floors = ", ".join(f"{name.replace('_', '-')} {value:.1%}" for name, value in result["baselines"].items())
+        self.console.print(
+            f"[bold]{result['success']:.1%}[/bold] of {result['trials']} trials on held-out tasks succeed "
+            f"(95% interval {low:.1%} to {high:.1%}; {floors}). {result['wall_clock_s']['total']:.0f} s in all. "
+            f"See {self.folder}"
+        )
+
+    @functools.cached_property
+    def _validation(self) -> DemoSet:
+        return self.demos("validation")
+
+    def _load(self) -> Training:
+        train, _ = self.demos("train"), self._validation
+        return training_on(self.env, self.config, train)
+
+    def _shapes(self) -> DemoSet:
+        return demos_lib.shapes(self.env, self.config.data.tasks, self.config.data.demos_per_task)
+
+    def _precompile(self, params: Params) -> list[Callable[[], None]]:
+        env, config, random = self.env, self.config.evaluation, Random(self.env.action_size)
+        return [
+            lambda: closed_loop.precompile(env, self.method, params, config),
+            lambda: closed_loop.precompile(env, random, (), config),
+        ]
+
+    def _validate(self, params: Params) -> tuple[float, dict[str, float]]:
+        return validation_of(self.env, self.method, params, self._validation, self.config.evaluation)
+
+    def _judge(self, params: Params) -> tuple[dict[str, Any], Callable[[dict[str, Any]], None]]:
+        config, test = self.config, self.demos("test")
+        with self._clock("evaluate"):
+            floors = closed_loop.baselines(self.env, test, config.evaluation, config.data, trial_key("test"))
+            trials, found = result_of(self.env, self.method, params, test, config, floors)
+
+        def draw(result: dict[str, Any]) -> None:
+            metrics = read_metrics(self.folder / "metrics.jsonl")
+            plots.learning_curve(metrics, result, self.folder / "learning_curve.png")
+            self._film(test, trials)
+
+        return found | {"demonstrations": self._demonstrations}, draw
+
+    def _film(self, test: DemoSet, trials: Trials, num_tasks: int = 3) -> None:
+        """Writes the video: demonstrations beside the first trial of the same held-out tasks, in large."""
+        height, width = self.env.image_shape
+        scale = max(1, 256 // height)
+        camera = envs.make(self.config.env_name, (scale * height, scale * width))
+        task, demo, trial = jax.tree.map(lambda x: x[:num_tasks], (test.task, test.states, trials.states))
+        clips = [closed_loop.film(camera, task, jax.tree.map(lambda x: x[:, 0], states)) for states in (demo, trial)]
+        plots.side_by_side(np.asarray(clips[0]), np.asarray(clips[1]), self.folder / "rollouts.gif")

@@ -1,0 +1,100 @@
+"""What training starts from, data with their statistics and the first parameters, and what it goes on from."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from milx.config.schema import Config
+from milx.core.checkpoint import UNVALIDATED, Checkpoints
+from milx.evaluation import provenance
+from milx.methods.whitening import Whitening
+from milx.networks import fixed_filters
+from milx.training.update import Trainer, TrainState
+
+
+class Training(NamedTuple):
+    """What a run trains on.
+
+    Attributes:
+        dataset_hash: of the training demonstrations.
+        whitening: their statistics.
+        at: the data from which the scan that begins at a step draws its batches.
+        first_images: [N, H, W, 3] uint8, what some of the demonstrations show first.
+    """
+
+    dataset_hash: str
+    whitening: Whitening
+    at: Callable[[int], Any]
+    first_images: Callable[[], np.ndarray]
+
+
+def check_steps(config: Config) -> None:
+    """Raises ValueError unless training and validation come after whole numbers of scans."""
+    for name in ("steps", "eval_every"):
+        value, scan = getattr(config.train, name), config.train.log_every
+        if value < 1 or value % scan:
+            raise ValueError(f"train.{name}: got {value}, expected a positive multiple of train.log_every = {scan}")
+
+
+def initial_state(trainer: Trainer, config: Config, training: Training) -> tuple[TrainState, jax.Array]:
+    """The state before the first meta-update on these demonstrations, and the key of the batches."""
+    init_key, batch_key = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), 3))
+    state = trainer.init(init_key, training.whitening)
+    if config.network.fixed_filters is None:
+        return state, batch_key
+    if config.network.fixed_filters == fixed_filters.KMEANS:
+        filters = fixed_filters.cluster(training.first_images(), config.network)
+    else:
+        filters = fixed_filters.load(config.network.fixed_filters, config.network)
+    return dataclasses.replace(state, params=fixed_filters.put(state.params, filters)), batch_key
+
+
+def save_state(
+    write: Callable[..., bool], state: TrainState, score: float, seconds: dict[str, float], dataset_hash: str
+) -> bool:
+    """Writes a checkpoint from which `restore_state` goes on.
+
+    Args:
+        write: `Checkpoints.save` or `Checkpoints.replace`.
+        state: what training has come to.
+        score: of its validation, or UNVALIDATED.
+        seconds: wall-clock by part, in s.
+        dataset_hash: of the training demonstrations.
+
+    Returns:
+        Whether it is written.
+    """
+    items = {"params": state.params, "trainer": (state.step, state.optimizer)}
+    extra = {"seconds": seconds, "dataset_hash": dataset_hash}
+    extra["versions"] = provenance.versions(("milx", "jax", "orbax-checkpoint"))
+    return write(int(state.step), items, score if np.isfinite(score) else UNVALIDATED, extra)
+
+
+def restore_state(
+    checkpoints: Checkpoints, step: int, state: TrainState, dataset_hash: str
+) -> tuple[TrainState, dict[str, float]]:
+    """The state of a checkpoint, and the seconds spent until then.
+
+    Args:
+        checkpoints: of the run.
+        step: which.
+        state: the run's first, for structure and shapes.
+        dataset_hash: of the demonstrations that there are now.
+
+    Raises:
+        ValueError: if the checkpoint was trained on other demonstrations, or does not hold this state.
+    """
+    like = {"params": state.params, "trainer": (state.step, state.optimizer)}
+    items, extra = checkpoints.restore(step, like)
+    if extra["dataset_hash"] != dataset_hash:
+        old, new = extra["dataset_hash"][:12], dataset_hash[:12]
+        raise ValueError(
+            f"workdir: {checkpoints.folder.parent} was trained on demonstrations {old}, but there are {new} now; "
+            "expected the data set, or the device and versions that planned them, with which the run began, or another "
+            "folder"
+        )
+    updates, optimizer = items["trainer"]
+    return TrainState(updates, items["params"], optimizer), extra["seconds"]

@@ -1,0 +1,172 @@
+"""Meta-training: everything between two log lines is one scan on the device.
+
+Sampling, rendering, inner step, meta-gradient and Adam all happen inside the scan. Batches are functions of the seed
+and the step, so a run that is stopped and started again repeats the uninterrupted run from its last checkpoint.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from milx.config.schema import OptimizerConfig, TrainConfig
+from milx.core import parallel
+from milx.core.batching import map_in_groups
+from milx.evaluation import listening
+from milx.methods.base import Method
+from milx.methods.whitening import Whitening
+from milx.types import Array, Params, TaskBatch
+
+Sample = Callable[[Any, jax.Array], TaskBatch]
+"""Draws a batch from demonstrations, a task for each of the keys [N]; called inside `jax.jit`."""
+
+_CPU_IMAGES = 100
+"""Images of a meta-batch that a CPU works on at once; at least one task's. With 500 of 80x64 each takes longer."""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class TrainState:
+    """What changes from one meta-update to the next.
+
+    Attributes:
+        step: int32, meta-updates done.
+        params: what the method learns.
+        optimizer: the optimizer's own state.
+    """
+
+    step: Array
+    params: Params
+    optimizer: Any
+
+
+def make_optimizer(config: OptimizerConfig, steps: int) -> optax.GradientTransformation:
+    """Adam with the configured schedule over `steps` meta-updates, after clipping the global norm."""
+    peak, warmup = config.learning_rate, round(config.warmup * steps)
+    then = optax.cosine_decay_schedule(peak, steps - warmup) if config.cosine else optax.constant_schedule(peak)
+    rate = optax.join_schedules([optax.linear_schedule(0.0, peak, max(warmup, 1)), then], [warmup])
+    clip = optax.identity() if config.clip_norm is None else optax.clip_by_global_norm(config.clip_norm)
+    return optax.chain(clip, optax.adam(rate))
+
+
+Loss = Callable[[Params, TaskBatch], tuple[jax.Array, dict[str, jax.Array]]]
+"""As `Method.loss`: the mean over a batch of N tasks, and metrics [N]."""
+
+
+def meta_gradient(loss: Loss, params: Params, batch: TaskBatch) -> tuple[Params, dict[str, jax.Array]]:
+    """The gradient of a loss, and its metrics, [N] of each task.
+
+    A CPU works on a few tasks at a time, so that what they need stays in its cache.
+
+    Args:
+        loss: of a batch of tasks, say `method.loss`.
+        params: what it is differentiated by.
+        batch: N tasks; all leaves have this leading axis.
+    """
+
+    def gradient(batch: TaskBatch) -> tuple[Params, dict[str, jax.Array]]:
+        return jax.grad(loss, has_aux=True)(params, batch)
+
+    images = [demo.image for demo in (batch.support, batch.query) if demo.image is not None]
+    if jax.default_backend() != "cpu" or not images:
+        return gradient(batch)
+    at_once = _CPU_IMAGES // sum(image.shape[1] * image.shape[2] for image in images)
+    if at_once >= len(batch.query.action):
+        return gradient(batch)
+    one_task = lambda task: gradient(jax.tree.map(lambda x: x[None], task))  # noqa: E731
+    grad, metrics = map_in_groups(one_task, (batch,), at_once)
+    return jax.tree.map(lambda x: x.mean(axis=0), grad), jax.tree.map(jnp.ravel, metrics)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Trainer:
+    """The meta-training loop's jitted part.
+
+    Attributes:
+        sample: draws batches from what `run` is given as `data`.
+        method: what learns.
+        train: batch sizes and length.
+        optimizer: the meta-optimizer.
+    """
+
+    sample: Sample
+    method: Method
+    train: TrainConfig
+    optimizer: optax.GradientTransformation
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def init(self, key: jax.Array, whitening: Whitening) -> TrainState:
+        """The state before the first meta-update."""
+        params = self.method.init(key, whitening)
+        return TrainState(jnp.zeros((), jnp.int32), params, self.optimizer.init(params))
+
+    def update(self, state: TrainState, data: Any, key: jax.Array) -> tuple[TrainState, dict[str, jax.Array]]:
+        """One meta-update on the batch of (key, state.step), unless its loss or its gradient is not finite.
+
+        Returns:
+            The next state, and the metrics' means over the tasks; "skipped" is 1 where the parameters stayed as they
+            were and the other metrics are 0, and "bad_task" the number of a task whose loss is not finite, else -1.
+        """
+
+        def gradient(
+            params: Params, data: Any, step: jax.Array, keys: jax.Array
+        ) -> tuple[Params, dict[str, jax.Array]]:
+            batch = self.sample(data, keys)
+            grad, metrics = self._gradient(params, batch, step)
+            task = jnp.zeros_like(metrics["loss"]) if batch.task is None else batch.task.astype(metrics["loss"].dtype)
+            bad = parallel.largest(jnp.where(jnp.isfinite(metrics["loss"]), -1, task).max())
+            return grad, {**jax.tree.map(jnp.mean, metrics), "bad_task": bad}
+
+        split = parallel.split_tasks(gradient, shared=3, average=True)
+        grad, metrics = split(state.params, data, state.step, self._keys(key, state.step))
+        metrics["grad_norm"] = optax.tree.norm(grad)
+        good = jnp.isfinite(metrics["grad_norm"]) & jnp.isfinite(metrics["loss"])
+        updates, optimizer = self.optimizer.update(grad, state.optimizer, state.params)
+        updated = optax.apply_updates(state.params, updates), optimizer
+        keep = lambda new, old: jnp.where(good, new, old)  # noqa: E731
+        params, optimizer = jax.tree.map(keep, updated, (state.params, state.optimizer))
+        bad_task = metrics.pop("bad_task")
+        metrics = {name: jnp.where(good, value, 0) for name, value in metrics.items()}
+        metrics |= {"skipped": 1 - good.astype(jnp.float32), "bad_task": bad_task}
+        return TrainState(state.step + 1, params, optimizer), metrics
+
+    def _keys(self, key: jax.Array, step: jax.Array) -> jax.Array:
+        """[N] which draw the batch of a step."""
+        return jax.random.split(jax.random.fold_in(key, step), self.train.meta_batch)
+
+    def _gradient(self, params: Params, batch: TaskBatch, step: jax.Array) -> tuple[Params, dict[str, jax.Array]]:
+        """That of plain imitation for the first updates, if so configured, and of the meta-objective after them."""
+        first = self.train.imitation_steps
+
+        def meta_objective(params: Params, batch: TaskBatch) -> tuple[jax.Array, dict[str, jax.Array]]:
+            return self.method.loss(params, batch, jnp.maximum(step - first, 0) / (self.train.steps - first))
+
+        if not first:
+            return meta_gradient(meta_objective, params, batch)
+        losses = self.method.imitation, meta_objective
+        branches = [functools.partial(meta_gradient, loss) for loss in losses]
+        return jax.lax.cond(step < first, *branches, params, batch)
+
+    @functools.partial(jax.jit, static_argnums=(0, 4))
+    def run(self, state: TrainState, data: Any, key: jax.Array, steps: int) -> tuple[TrainState, dict[str, jax.Array]]:
+        """Runs `steps` meta-updates in one scan.
+
+        Returns:
+            The state, and the metrics' means over the updates that were not skipped; "skipped" is how many were, and
+            "bad_task" the largest. What `listening.measure` finds is of the last parameters and the batch that comes
+            next.
+        """
+        state, metrics = jax.lax.scan(lambda s, _: self.update(s, data, key), state, length=steps)
+        skipped, bad_task = metrics.pop("skipped").sum(), metrics.pop("bad_task").max()
+        means = {name: value.sum() / jnp.maximum(steps - skipped, 1) for name, value in metrics.items()}
+        batch = parallel.split_tasks(self.sample, shared=1)(data, self._keys(key, state.step))
+        return state, {
+            **means,
+            **listening.measure(self.method, state.params, batch),
+            "skipped": skipped,
+            "bad_task": bad_task,
+        }

@@ -1,0 +1,20 @@
+"""Where a demonstration leads, worked out by hand."""
+
+import numpy as np
+
+from milx.data.goals import goals
+
+#                  x    y    height
+STATE = np.array(
+    [[0.0, 4.0, 0.03], [1.0, 5.0, 0.20], [2.0, 6.0, 0.15], [3.0, 7.0, 0.09], [4.0, 8.0, 0.02], [5.0, 9.0, 0.21]]
+)
+
+
+def test_without_a_height_the_goal_is_the_end():
+    np.testing.assert_array_equal(goals(STATE, (0, 1), None), np.tile([5.0, 9.0], (6, 1)))
+
+
+def test_with_a_height_it_is_where_the_hand_comes_down_until_it_has():
+    """It starts low and rises. The middle of its heights is 0.11: it is down from the fourth step on."""
+    expected = [[7.0, 3.0]] * 3 + [[np.nan, np.nan]] * 3
+    np.testing.assert_array_equal(goals(STATE, (1, 0), 2), expected)

@@ -1,0 +1,123 @@
+"""Exported policies say what the policies say, in a process that has neither milx nor Flax nor MuJoCo."""
+
+import json
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import milx
+from milx import methods
+from milx.config.presets import make_config
+from milx.deploy.policy import Policy
+from milx.export import export
+from milx.methods.whitening import Whitening
+
+T = 50
+PROGRAM = """
+import json, sys
+folder, inputs, outputs = sys.argv[1:]
+sys.path.insert(0, folder)
+import numpy as np
+from policy import Policy
+policy = Policy(folder)
+arrays = dict(np.load(inputs))
+demo = {name: arrays[name] for name in policy.sizes["adapt"]}
+task_params = policy.adapt(**demo)
+seen = [{name: arrays[f"seen_{name}"][i] for name in policy.sizes["act"]} for i in range(3)]
+np.save(outputs, np.stack([policy.act(task_params, **one) for one in seen]))
+print(json.dumps(sorted({name.split(".")[0] for name in sys.modules})))
+"""
+
+
+def make_policy(method="mil", **mil):
+    """An untrained policy for small images, whose whitening is not the identity."""
+    env = milx.make("reach", (16, 20))
+    config = make_config("reach", method, "cpu")
+    config.env.image_shape = (16, 20)
+    config.network.filters, config.network.strides, config.network.fc_layers = (4, 4), (2, 2), (16,)
+    config.network.learned_loss = "linear" if mil.get("given", "") not in ("", "video+state+action") else None
+    config.network.hindsight_head = mil.get("given") == "video"
+    for name, value in mil.items():
+        setattr(config.mil, name, value)
+    spec = env.spec
+    whitening = Whitening(jnp.full(8, 0.2), jnp.full(8, 2.0), jnp.full(2, 0.1), jnp.full(2, 0.3))
+    made = methods.make(config, spec)
+    return Policy(made, spec, jax.jit(made.init)(jax.random.key(0), whitening), config)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "shots"),
+    [({}, 1), ({"given": "video", "inner_steps": 2}, 2), ({"method": "lstm"}, 2)],
+    ids=["mil", "from two videos alone, in hindsight", "lstm, two shots"],
+)
+def test_another_process_gets_the_same_actions(tmp_path, arguments, shots):
+    policy, rng = make_policy(**arguments), np.random.default_rng(0)
+    demo = milx.Demo(
+        image=rng.integers(0, 256, (shots, T, 16, 20, 3), np.uint8),
+        state=rng.normal(size=(shots, T, 8)).astype(np.float32),
+        action=rng.uniform(-1, 1, (shots, T, 2)).astype(np.float32),
+    )
+    seen = {
+        "image": rng.integers(0, 256, (3, 16, 20, 3), np.uint8),
+        "state": rng.normal(size=(3, 8)).astype(np.float32),
+    }
+    given = {name: getattr(demo, name) for name in ("image", "state", "action")}
+    task_params = policy.adapt(policy.params, demo)
+    expected = [policy.act(task_params, milx.Observation(*each)) for each in zip(*seen.values(), strict=True)]
+
+    folder = tmp_path / "out"
+    export(policy, folder, shots)
+    np.savez(tmp_path / "in.npz", **given, **{f"seen_{name}": value for name, value in seen.items()})
+    command = [sys.executable, "-c", PROGRAM, folder, tmp_path / "in.npz", tmp_path / "out.npy"]
+    done = subprocess.run([*map(str, command)], capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert not {"milx", "flax", "mujoco", "optax", "orbax"} & set(json.loads(done.stdout.splitlines()[-1]))
+    found = np.load(tmp_path / "out.npy")
+    np.testing.assert_allclose(found, np.stack(expected), atol=1e-5)
+    assert np.abs(found[0] - found[1]).max() > 1e-4
+    unadapted = policy.method.unadapted(policy.params)
+    if unadapted is not None:
+        assert (
+            np.abs(policy.act(unadapted, milx.Observation(seen["image"][0], seen["state"][0])) - found[0]).max() > 1e-4
+        )
+    with pytest.raises(ValueError, match=r"out: .* exists, expected a folder that does not"):
+        export(policy, folder)
+
+
+def test_programs_are_for_cpu_and_cuda_and_other_inputs_are_refused(tmp_path):
+    from jax import export as jax_export
+
+    export(make_policy(), tmp_path / "out")
+    for name in ("adapt", "act"):
+        program = jax_export.deserialize(bytearray((tmp_path / "out" / f"{name}.bin").read_bytes()))
+        assert set(program.platforms) == {"cpu", "cuda"}
+
+    from milx.deploy import standalone
+
+    policy, rng = standalone.Policy(tmp_path / "out"), np.random.default_rng(0)
+    image, state = rng.integers(0, 256, (70, 16, 20, 3), np.uint8), rng.normal(size=(70, 8))
+    action = rng.normal(size=(70, 2))
+    task_params = policy.adapt(image=image, state=state, action=action)
+    index = np.linspace(0, 69, 50).round().astype(int)
+    same = policy.adapt(image=image[index][None], state=state[index][None], action=action[index][None])
+    jax.tree.map(np.testing.assert_array_equal, task_params, same)
+    for arguments, message in (
+        (
+            {"image": image, "state": state},
+            r"fields: got \['image', 'state'\], expected \['action', 'image', 'state'\]",
+        ),
+        ({"image": image, "state": state[:, :7], "action": action}, r"state: got shape \[70, 7\], expected \[..., 8\]"),
+        ({"image": image / 255, "state": state, "action": action}, "image: got float64, expected uint8"),
+        ({"image": np.stack([image] * 2), "state": state, "action": action}, "image: got 2 demonstrations, expected 1"),
+        ({"image": image[:60], "state": state, "action": action}, r"time steps: got \{.*\}, expected the same of all"),
+        ({"image": image, "state": state, "action": action * np.nan}, "action: got values that are not finite"),
+        ({"image": image[:0], "state": state, "action": action}, r"image: got shape \[0, 16, 20, 3\]"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            policy.adapt(**arguments)
+    with pytest.raises(ValueError, match=r"state: got shape \[70, 8\], expected \[..., 8\]"):
+        policy.act(task_params, image=image[0], state=state)

@@ -1,0 +1,53 @@
+"""Policies that ship with milx are those whose results they carry."""
+
+import jax
+import numpy as np
+import pytest
+
+import milx
+from milx.config.presets import make_config
+from milx.core import pytrees
+from milx.deploy import pretrained
+from milx.deploy.policy import Policy
+
+
+@pytest.mark.parametrize("name", ["place", "push", "reach"])
+def test_a_shipped_policy_is_adapted_by_its_demonstration(name):
+    """Its result is above the task-blind floor, and what it does depends on what it was shown."""
+    policy = milx.load(name)
+    result = pretrained.result(name)
+    assert result["wilson95"][0] > result["baselines"]["task_blind"]
+    assert result["params_hash"] == pytrees.fingerprint(policy.params)
+    spec, rng = policy.spec, np.random.default_rng(0)
+    state = np.asarray(policy.params["whitening"].state_mean)
+    image = rng.integers(0, 256, (2, 6, *spec.image_shape, 3), np.uint8)
+    action = np.zeros((6, spec.action_size), np.float32)
+    seen = milx.Observation(image[0, 0], state)
+    actions = []
+    for shown in image:
+        task_params = policy.adapt(policy.params, milx.Demo(shown, np.tile(state, (6, 1)), action))
+        actions.append(np.asarray(policy.act(task_params, seen)))
+    assert np.isfinite(actions).all()
+    assert np.abs(actions[0] - actions[1]).max() > 1e-4
+
+
+def test_no_other_policies_ship():
+    assert pretrained.names() == ["place", "push", "reach"]
+
+
+def test_what_is_saved_is_loaded(tmp_path, monkeypatch):
+    monkeypatch.setattr(pretrained, "FOLDER", tmp_path)
+    config = make_config("reach_state", preset="cpu")
+    spec = milx.make("reach_state").spec
+    method = milx.methods.make(config, spec)
+    like = milx.methods.params_like(method, spec)
+    rng = np.random.default_rng(0)
+    params = jax.tree.map(lambda x: rng.normal(size=x.shape).astype(x.dtype), like)
+    pretrained.save(
+        Policy(method, spec, params, config), {"config": milx.config.schema.to_dict(config)}, tmp_path / "mine"
+    )
+    loaded = milx.load("mine")
+    jax.tree.map(np.testing.assert_array_equal, loaded.params, params)
+    assert loaded.config == config
+    with pytest.raises(ValueError, match=r"run: got 'yours', expected the folder of a run, or one of mine, which ship"):
+        milx.load("yours")

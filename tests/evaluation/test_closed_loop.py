@@ -1,0 +1,215 @@
+"""Wilson's interval, which scenes are tried, and that the size of a batch changes nothing."""
+
+import dataclasses
+import types
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.stats
+from tiny import tiny_config
+
+from milx.config.schema import EvalConfig
+from milx.core.batching import map_in_chunks, map_in_groups
+from milx.evaluation import closed_loop, intervals
+from milx.methods import Method
+from milx.training import simulated
+
+# Wilson's interval of k successes in n trials, to four digits; by hand, 0/n ends at z^2 / (n + z^2).
+KNOWN = {
+    (0, 10): (0.0, 0.2775),
+    (9, 10): (0.5958, 0.9821),
+    (10, 10): (0.7225, 1.0),
+    (5, 10): (0.2366, 0.7634),
+}
+
+
+@pytest.mark.parametrize(("successes", "trials"), KNOWN)
+def test_wilson_interval_against_known_values(successes, trials):
+    np.testing.assert_allclose(intervals.wilson_interval(successes, trials), KNOWN[successes, trials], atol=5e-5)
+
+
+@pytest.mark.parametrize("trials", [1, 4, 7, 10, 50, 150, 200, 600, 1500])
+def test_wilson_interval_against_scipy(trials):
+    for successes in {0, 1, trials // 3, trials - 1, trials}:
+        expected = scipy.stats.binomtest(successes, trials).proportion_ci(method="wilson")
+        low, high = intervals.wilson_interval(successes, trials)
+        np.testing.assert_allclose((low, high), (expected.low, expected.high), atol=1e-7)
+        assert 0 <= low <= successes / trials <= high <= 1
+
+
+def test_a_result_counts_trials_by_every_criterion_and_has_floors_beside_each():
+    table = jnp.array([[True, False, True], [False, False, True]])
+    floors = closed_loop.Floors({"random": 0.1}, {"nearly": {"random": 0.2}})
+    env = types.SimpleNamespace(vision=True, criterion="exactly", target_kind=lambda task: task)
+    trials = closed_loop.Trials(table, {"nearly": ~table | table}, ())
+    misled = closed_loop.Trials(~table, {"nearly": table}, ())
+    found = closed_loop.describe(env, tiny_config(), jnp.array([-1, -1]), trials, misled, floors)
+    assert (found["trials"], found["success"]) == (6, 0.5)
+    assert found["baselines"] == {"random": 0.1, "other_demo": 0.5}
+    assert found["wilson95"] == list(intervals.wilson_interval(3, 6))
+    np.testing.assert_allclose(found["bootstrap95"], [1 / 3, 2 / 3], rtol=1e-6)
+    other = found["other_criteria"]["nearly"]
+    assert (other["success"], other["bootstrap95"]) == (1.0, [1.0, 1.0])
+    assert other["wilson95"] == list(intervals.wilson_interval(6, 6))
+    assert other["baselines"] == {"random": 0.2, "other_demo": 0.5}
+
+
+def test_bootstrap_interval_is_over_things_and_not_over_trials():
+    """Where trials agree with those of the same thing, its percentiles are the binomial's of so many things."""
+    kind = np.random.default_rng(1).permutation(np.repeat(np.arange(16), 10))
+    success = np.repeat((kind < 8)[:, None], 6, axis=1)
+    expected = scipy.stats.binom(16, 0.5).ppf([0.025, 0.975]) / 16
+    np.testing.assert_allclose(intervals.bootstrap_interval(success, kind), expected, atol=1e-9)
+    low, high = intervals.wilson_interval(int(success.sum()), success.size)
+    assert high - low < 0.25 * (expected[1] - expected[0])
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Replay(Method):
+    """Repeats the first demonstration's actions, whatever it sees: the memory counts the steps."""
+
+    def init(self, key, whitening):
+        return ()
+
+    def loss(self, params, batch, progress=1.0):
+        raise NotImplementedError
+
+    def adapt(self, params, demo):
+        return demo.action[0]
+
+    def act(self, task_params, observation, memory):
+        return task_params[memory], memory + 1
+
+    def initial_memory(self, key):
+        return jnp.zeros((), jnp.int32)
+
+
+def test_table_is_the_same_for_batches_of_two_and_three_and_for_tasks_adapted_one_by_one(trained, monkeypatch):
+    env, key, config = trained.run.env, jax.random.key(5), EvalConfig(trials=24, shots=1, batch=3)
+
+    def succeed(batch):
+        chosen = dataclasses.replace(config, batch=batch)
+        return closed_loop.run_trials(env, Replay(), (), trained.test, chosen, key).success
+
+    three, two = succeed(3), succeed(2)
+    monkeypatch.setattr(closed_loop, "_PIXELS", 1)
+    one_by_one = succeed(3)
+    assert three.shape == (3, 24)
+    assert 0 < three.mean() < 1, "replay succeeds by luck in some scenes"
+    np.testing.assert_array_equal(two, three)
+    np.testing.assert_array_equal(one_by_one, three)
+
+
+@pytest.mark.parametrize(("shots", "pixels", "at_once"), [(2, 8000 * 3, 3), (2, 8000 * 3 - 1, 2), (1, 8000 * 3, 6)])
+def test_so_many_tasks_are_adapted_at_once_as_share_the_pixels(shots, pixels, at_once, monkeypatch):
+    monkeypatch.setattr(closed_loop, "_PIXELS", pixels)
+    action = np.zeros((7, shots, 50, 2))
+    assert closed_loop._tasks_at_once(types.SimpleNamespace(vision=True, image_shape=(8, 10)), action) == at_once
+    assert closed_loop._tasks_at_once(types.SimpleNamespace(vision=False, image_shape=(8, 10)), action) == 7
+
+
+@pytest.mark.parametrize("split", ["validation", "test"])
+def test_no_trial_takes_place_in_the_demonstration_s_scene(trained, split, monkeypatch):
+    demos = getattr(trained, split)
+    # What a trial is given: its scene, and the demonstration that the policy adapts to.
+    monkeypatch.setattr(
+        closed_loop,
+        "_run_batch",
+        lambda env, method, params, task, shown, states, action, scene, key: (scene, states, action),
+    )
+    config = dataclasses.replace(trained.config.evaluation, trials=10)
+    key = simulated.trial_key(split)
+    scene, states, action = closed_loop.run_trials(trained.run.env, trained.run.method, (), demos, config, key)
+    np.testing.assert_array_equal(action, demos.action[:, :1])
+    cubes, shown = np.asarray(scene.mocap_pos), np.asarray(states.mocap_pos[:, :, 0])
+    assert cubes.shape == (3, 10, 3, 3)
+    apart = np.abs(cubes[:, :, None] - shown[:, None]).max(axis=(-2, -1))
+    assert apart.min() > 0.01, "some cube stands at least 1 cm elsewhere"
+    flat = cubes.reshape(30, -1)
+    between = np.abs(flat[:, None] - flat).max(axis=-1) + np.eye(30)
+    assert between.min() > 0.01, "no two trials share a scene"
+    np.testing.assert_array_equal(scene.qpos, 0)
+
+
+@pytest.mark.parametrize(("trials", "asked", "tried"), [(3, 1, 1), (2, 2, 2), (2, 10, 2)])
+def test_baselines_run_in_the_first_trials(trained, monkeypatch, trials, asked, tried):
+    env, key = trained.run.env, simulated.trial_key("test")
+    config = dataclasses.replace(trained.config.evaluation, trials=trials, baseline_trials=asked)
+    asked_for = {}
+
+    def watch(env, task, scene, keys, options, noise):
+        asked_for.update(task=task, scene=scene)
+        assert noise == 0.0
+        return jax.tree.map(lambda x: jnp.repeat(x[:, None], env.horizon + 1, axis=1), scene), None
+
+    monkeypatch.setattr(closed_loop, "perform", watch)
+    plans = dataclasses.replace(trained.config.data, plan_batch=2 * 3 * tried)
+    rates = closed_loop.baselines(env, trained.test, config, plans, key).success
+    scene = closed_loop.trial_scenes(env, trained.test.task, jax.random.split(key)[0], trials)
+    expected = jax.tree.map(lambda x: x[:, :tried].reshape(-1, *x.shape[2:]), scene)
+    twice = jax.tree.map(lambda x: jnp.concatenate([x, x]), expected)
+    jax.tree.map(np.testing.assert_array_equal, asked_for["scene"], twice)
+    targets = np.asarray(asked_for["task"].target).reshape(2, 3, tried)
+    np.testing.assert_array_equal(targets[1], np.repeat(trained.test.task.target[:, None], tried, axis=1))
+    # Nobody moves, so both experts fare as the arm at rest does, judged by the true target.
+    resting = jax.tree.map(lambda x: jnp.repeat(x[:, None], env.horizon + 1, axis=1), expected)
+    task = jax.tree.map(lambda x: jnp.repeat(x, tried, axis=0), trained.test.task)
+    rate = float(jax.vmap(env.success)(task, resting).mean())
+    assert rates["expert"] == rates["task_blind"] == pytest.approx(rate)
+
+
+def test_programs_compiled_ahead_are_found(trained, caplog):
+    method, config = Replay(), dataclasses.replace(trained.config.evaluation, trials=4)
+    compiled = []
+    with jax.log_compiles():
+        closed_loop.precompile(trained.run.env, method, (), config)
+        compiled.append("XLA compilation of jit(_run_batch)" in caplog.text)
+        caplog.clear()
+        closed_loop.run_trials(trained.run.env, method, (), trained.test, config, jax.random.key(0))
+        compiled.append("XLA compilation of jit(_run_batch)" in caplog.text)
+    assert compiled == [True, False]
+
+
+def test_validation_and_test_trials_differ(trained):
+    scenes = [
+        closed_loop.trial_scenes(trained.run.env, trained.test.task, simulated.trial_key(split), 4).mocap_pos
+        for split in ("validation", "test")
+    ]
+    assert np.abs(scenes[0] - scenes[1]).max(axis=(-2, -1)).min() > 0.01
+
+
+@pytest.mark.parametrize(("total", "size"), [(7, 3), (7, 7), (7, 10), (6, 3), (1, 4), (7, 1)])
+def test_map_in_chunks_is_a_plain_call(total, size):
+    rng = np.random.default_rng(0)
+    inputs = ({"a": jnp.asarray(rng.standard_normal((total, 2)))}, jnp.arange(total))
+    shapes = []
+
+    def function(tree, index):
+        shapes.append(index.shape)
+        return {"sum": tree["a"].sum(axis=1) + index}, tree["a"] * index[:, None]
+
+    found = map_in_chunks(function, inputs, size)
+    assert shapes == [(size,)] * -(-total // size), "every call has the same size"
+    jax.tree.map(np.testing.assert_array_equal, found, function(*inputs))
+
+
+@pytest.mark.parametrize(("total", "most", "groups"), [(6, 4, 2), (6, 6, 1), (6, 9, 1), (7, 4, 7), (4, 0, 4)])
+def test_map_in_groups_is_vmap_in_the_fewest_equal_groups(total, most, groups):
+    def function(key, x, empty):
+        return jax.random.randint(key, (2,), 0, 1000) + x, empty
+
+    # Some parameters have no entries.
+    inputs = jax.random.split(jax.random.key(0), total), jnp.arange(total), jnp.zeros((total, 0))
+    by_groups = jax.jit(lambda *inputs: map_in_groups(function, inputs, most))
+    for found, expected in zip(by_groups(*inputs), jax.vmap(function)(*inputs), strict=True):
+        np.testing.assert_array_equal(found, expected)
+    program = str(jax.make_jaxpr(by_groups)(*inputs))
+    assert (f"length={groups}" in program) if groups > 1 else ("scan" not in program)
+
+
+def test_map_in_chunks_takes_keys():
+    keys = jax.random.split(jax.random.key(0), 5)
+    draw = jax.vmap(jax.random.uniform)
+    np.testing.assert_array_equal(map_in_chunks(draw, (keys,), 2), draw(keys))

@@ -1,0 +1,290 @@
+"""A run on recorded demonstrations, from importing to a policy: the demonstrations are of tasks with a known answer."""
+
+import contextlib
+import dataclasses
+import io
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from rich.console import Console
+from tiny import QUIET
+
+import milx
+from milx.core.checkpoint import UNVALIDATED, Checkpoints
+from milx.data.dataset import DataSet, Writer
+from milx.deploy import standalone
+from milx.export import export
+from milx.methods.mil import MIL
+from milx.training import recorded, signals
+from milx.training.factory import make_run
+from milx.training.metrics import MetricsWriter
+from milx.training.recorded import RecordedRun
+from milx.types import Demo
+
+HORIZON = 8
+MEAN, SPREAD = np.array([3.0, -1.0]), np.array([2.0, 0.1])
+"""Of the actions, of very different sizes."""
+
+
+def random_demo(rng, direction, length):
+    """Images of a task's colour; actions along its direction, and on the state."""
+    state = rng.normal(size=(length, 3)).astype(np.float32)
+    color = np.uint8(128 + 100 * np.append(direction, 0.0))
+    image = np.broadcast_to(color, (length, 12, 16, 3))
+    action = MEAN + SPREAD * (1.5 * direction + 0.5 * state[:, :2])
+    return Demo(image, state, action.astype(np.float32))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """40 tasks, each a direction, with 3 demonstrations of 7 to 12 steps."""
+    folder, rng = tmp_path_factory.mktemp("recording") / "set", np.random.default_rng(0)
+    with Writer(folder, (12, 16), 3, 2, "a test") as writer:
+        for task in range(40):
+            angle = rng.uniform(0, 2 * np.pi)
+            direction = np.array([np.cos(angle), np.sin(angle)])
+            demos = [random_demo(rng, direction, length) for length in rng.integers(7, 13, 3)]
+            split = "validation" if task < 4 else "test" if task < 10 else "train"
+            writer.add(f"direction {task}", split, [len(demo.state) for demo in demos], demos)
+    return folder
+
+
+def tiny_config(folder):
+    config = recorded.make_config(folder, preset="cpu")
+    config.recorded.horizon = HORIZON
+    config.network.filters, config.network.strides, config.network.fc_layers = (4, 4), (2, 1), (40, 40)
+    config.train.steps, config.train.log_every, config.train.eval_every = 600, 100, 200
+    config.train.meta_batch, config.optimizer.learning_rate = 8, 3e-3
+    return config
+
+
+@pytest.fixture(scope="module")
+def trained(cache, folder, tmp_path_factory):
+    run = make_run(tiny_config(folder), tmp_path_factory.mktemp("run"), QUIET)
+    run.train()
+    return run, run.evaluate()
+
+
+def test_held_out_tasks_are_learnt_from_their_demonstration(trained):
+    """The direction is the task; its share of the actions' variance is 1.5^2/2 of 1.5^2/2 + 0.5^2."""
+    run, result = trained
+    errors = result["action_error"]
+    assert errors["tasks"] == 6
+    assert errors["mean_action"] == pytest.approx(1, abs=0.25)
+    assert errors["after"] < 0.4 * errors["before"]
+    assert errors["other_task"] > errors["mean_action"]
+    assert result["score"] == pytest.approx(1 - errors["after"] / errors["mean_action"])
+    lines = [json.loads(line) for line in (run.folder / "metrics.jsonl").open()]
+    scores = [line["validation_score"] for line in lines if "validation_score" in line]
+    assert len(scores) == 3
+    assert max(scores) > 0.5
+    assert (run.folder / "learning_curve.png").stat().st_size > 1000
+
+
+def read_resampled(data, task):
+    steps = [np.linspace(0, length - 1, HORIZON).round().astype(int) for length in data.header.tasks[task].lengths]
+    return [data.read(task, i, index) for i, index in enumerate(steps)]
+
+
+def test_errors_are_those_of_a_loop_over_demonstrations(trained, folder):
+    """What the run reports, worked out with the policy that users load, step by step."""
+    run, result = trained
+    policy, data = milx.load(run.folder), DataSet(folder)
+    training = recorded.read_vectors(data, data.header.of_split("train"), HORIZON).action
+    errors = []
+    for task in data.header.of_split("test"):
+        demos = read_resampled(data, task)
+        task_params = policy.adapt(policy.params, demos[0])
+        for query in demos[1:]:
+            for image, state, action in zip(query.image, query.state, query.action, strict=True):
+                found = np.asarray(policy.act(task_params, milx.Observation(image, state)))
+                errors.append(np.mean(((found - action) / training.std(axis=0)) ** 2))
+    assert np.mean(errors) == pytest.approx(result["action_error"]["after"], rel=1e-4)
+
+
+def test_whitening_is_fitted_to_the_training_tasks_alone(trained, folder):
+    run, _ = trained
+    data = DataSet(folder)
+    rows = [demo for task in data.header.of_split("train") for demo in read_resampled(data, task)]
+    whitening = milx.load(run.folder).params["whitening"]
+    for field in ("state", "action"):
+        values = np.concatenate([getattr(row, field) for row in rows])
+        np.testing.assert_allclose(getattr(whitening, f"{field}_mean"), values.mean(axis=0), rtol=1e-4, atol=1e-4)
+        np.testing.assert_allclose(getattr(whitening, f"{field}_scale"), values.std(axis=0), rtol=1e-4)
+
+
+def test_an_interrupted_run_ends_bit_for_bit_like_the_uninterrupted_one(trained, folder, tmp_path, monkeypatch, capsys):
+    """Also when the data passes by in shards, of which none is whole."""
+    config = tiny_config(folder)
+    config.train.steps, config.train.eval_every = 200, 100
+    size = 3 * HORIZON * (12 * 16 * 3 + 4 * 5) * 1.01
+    config.recorded.gib = 4 * size / 2**30
+
+    def final(folder):
+        run = RecordedRun(config, folder, QUIET)
+        assert run.shards.num_tasks == 4
+        run.train()
+        return milx.load(folder).params
+
+    with monkeypatch.context() as patch:
+        validate = RecordedRun._validate
+
+        def stop(self, params):
+            patch.setattr(RecordedRun, "_validate", interrupt)
+            return validate(self, params)
+
+        def interrupt(self, params):
+            raise KeyboardInterrupt
+
+        patch.setattr(RecordedRun, "_validate", stop)
+        with pytest.raises(KeyboardInterrupt):
+            final(tmp_path / "stopped")
+    with monkeypatch.context() as patch:
+        write, told = MetricsWriter.write, []
+
+        def terminate(self, step, values):
+            told.append(step)
+            write(self, step, values)
+
+        patch.setattr(MetricsWriter, "write", terminate)
+        patch.setattr(signals.Stop, "listen", contextlib.nullcontext)
+        patch.setattr(signals.Stop, "asked", property(lambda _: bool(told), lambda *_: None), raising=False)
+        with pytest.raises(SystemExit) as ended:
+            final(tmp_path / "terminated")
+    assert ended.value.code == 0
+    assert "milx: stopped at step 100; the same command goes on from there" in capsys.readouterr().out
+    straight = final(tmp_path / "straight")
+    best = Checkpoints(tmp_path / "straight" / "checkpoints", read_only=True).best
+    for name in ("stopped", "terminated"):
+        folder = tmp_path / name / "checkpoints"
+        before = Checkpoints(folder, read_only=True)
+        assert before.latest == {"stopped": 200, "terminated": 100}[name]
+        assert before.score(before.latest) == UNVALIDATED
+        jax.tree.map(np.testing.assert_array_equal, final(tmp_path / name), straight)
+        after = Checkpoints(folder, read_only=True)
+        assert (after.latest, after.best) == (200, best)
+        assert after.score(100) > UNVALIDATED
+
+
+def test_bad_data_is_refused_before_anything_is_compiled(folder, tmp_path):
+    config = tiny_config(folder)
+    for change, message in (
+        ({"path": str(tmp_path)}, "data: .* has no zarr.json, expected a folder written by milx.data"),
+        ({"goal_indices": (3,)}, r"recorded.goal_indices: got 3, expected less than 3"),
+        ({"horizon": 0}, r"recorded.horizon: got 0, expected a whole number, at least 1"),
+        ({"gib": 1e-9}, r"recorded.gib: got 1e-09, expected at least"),
+    ):
+        bad = dataclasses.replace(config, recorded=dataclasses.replace(config.recorded, **change))
+        with pytest.raises(ValueError, match=message):
+            RecordedRun(bad, tmp_path / "run", QUIET)
+    config.train.shots = 3
+    with pytest.raises(ValueError, match=r"expected at least one with more than train.shots = 3 demonstrations"):
+        RecordedRun(config, tmp_path / "run", QUIET)
+
+
+def run_with_losses(folder, workdir, monkeypatch, spoil):
+    """A run in which the loss of every task is multiplied by `spoil(number of the task)`; returns what it said, too."""
+    config = tiny_config(folder)
+    config.train.steps = config.train.eval_every = 60
+    config.train.log_every, config.train.meta_batch = 20, 2
+    original = MIL.loss
+
+    def loss(self, params, batch, progress=1.0):
+        _, metrics = original(self, params, batch, progress)
+        each = metrics["loss"] * spoil(batch.task)
+        return each.mean(), {**metrics, "loss": each}
+
+    monkeypatch.setattr(MIL, "loss", loss)
+    console = Console(record=True, width=200, file=io.StringIO())
+    return RecordedRun(config, workdir, console), console
+
+
+def test_updates_that_are_not_finite_are_skipped_counted_and_named(folder, tmp_path, monkeypatch):
+    """One training task of thirty is to blame: about one batch of two in fifteen, and no parameter sees it."""
+    run, console = run_with_losses(folder, tmp_path, monkeypatch, lambda n: jnp.where(n == 17, jnp.nan, 1.0))
+    run.train()
+    lines = [json.loads(line) for line in (tmp_path / "metrics.jsonl").open()]
+    skipped = [line["skipped"] for line in lines if "skipped" in line]
+    assert 0 < sum(skipped) < 20
+    assert {line["bad_task"] for line in lines if line.get("skipped")} == {17}
+    assert all(np.isfinite(line["loss"]) for line in lines if "loss" in line)
+    said = console.export_text()
+    assert said.count("were skipped: something was not finite, in task 17 of the training set") == np.count_nonzero(
+        skipped
+    )
+    params = milx.load(tmp_path).params
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(params))
+
+
+def test_a_run_without_a_finite_update_stops(folder, tmp_path, monkeypatch):
+    run, _ = run_with_losses(folder, tmp_path, monkeypatch, lambda n: jnp.inf * jnp.ones_like(n, jnp.float32))
+    monkeypatch.setattr("milx.training.run.MOST_IN_VAIN", 30)  # after two scans of 20
+    with pytest.raises(ValueError, match="no update of the last 40 was finite; there is no checkpoint"):
+        run.train()
+
+
+def test_where_there_are_no_states_none_are_needed(tmp_path):
+    """From the data set to the exported policy, which is that of `milx.load`."""
+    rng = np.random.default_rng(0)
+    with Writer(tmp_path / "set", (12, 16), 0, 2, "a test") as writer:
+        for task, split in enumerate(("train", "train", "validation", "test")):
+            demos = [dataclasses.replace(random_demo(rng, np.ones(2), HORIZON), state=None) for _ in range(2)]
+            writer.add(f"task {task}", split, [HORIZON] * 2, demos)
+    config = tiny_config(tmp_path / "set")
+    config.train.steps = config.train.log_every = config.train.eval_every = config.train.meta_batch = 2
+    run = make_run(config, tmp_path / "run", QUIET)
+    run.train()
+    assert np.isfinite(run.evaluate()["action_error"]["after"])
+    policy, demo = milx.load(tmp_path / "run"), demos[0]
+    task_params = policy.adapt(policy.params, demo)
+    action = policy.act(task_params, milx.Observation(demo.image[0], None))
+    export(policy, tmp_path / "out")
+    alone = standalone.Policy(tmp_path / "out")
+    assert alone.sizes["act"] == {"image": [12, 16, 3]}
+    found = alone.act(alone.adapt(image=demo.image, action=demo.action), image=demo.image[0])
+    np.testing.assert_allclose(found, action, atol=1e-5)
+
+
+def test_what_may_be_shown_without_actions_is_not_what_is_asked_for(tmp_path):
+    """One of three demonstrations shows actions: it is the query, whether it comes first or last."""
+    rng = np.random.default_rng(0)
+    for place in range(3):
+        folder = tmp_path / f"set {place}"
+        with Writer(folder, (12, 16), 3, 2, "a test") as writer:
+            for split in ("train", "validation", "test"):
+                demos = [random_demo(rng, np.ones(2), HORIZON) for _ in range(3)]
+                demos = [demo if i == place else dataclasses.replace(demo, action=None) for i, demo in enumerate(demos)]
+                writer.add(split, split, [HORIZON] * 3, demos)
+        config = tiny_config(folder)
+        config.mil.given, config.network.learned_loss = "video+state", "linear"
+        queries, support = make_run(config, tmp_path / f"run {place}", QUIET)._task(1, 2)
+        assert queries.acts.tolist() == [True] + [False] * (len(queries.acts) - 1)
+        np.testing.assert_array_equal(queries.demo.action[0], DataSet(folder).read(1, place).action)
+        assert not any((shown == queries.demo.state[0]).all() for shown in support.state)
+
+
+def test_data_that_are_not_finite_are_refused_by_name(tmp_path):
+    rng = np.random.default_rng(0)
+    demos = [random_demo(rng, np.ones(2), 8) for _ in range(3)]
+    demos[1].action[3, 0] = np.inf
+    with Writer(tmp_path / "set", (12, 16), 3, 2, "a test") as writer:
+        writer.add("lift", "train", [8, 8, 8], demos)
+        for split in ("validation", "test"):
+            writer.add(split, split, [8, 8], [random_demo(rng, np.ones(2), 8) for _ in range(2)])
+    run = RecordedRun(tiny_config(tmp_path / "set"), tmp_path / "run", QUIET)
+    with pytest.raises(
+        ValueError, match=r"data: action of demonstration 1 of task 0 \('lift'\): got values that are not"
+    ):
+        run._load()
+
+
+def test_the_report_names_the_floors(trained):
+    run, result = trained
+    run.console = Console(record=True, width=200, file=io.StringIO())
+    run.report(result)
+    text = run.console.export_text()
+    assert f"{result['action_error']['after']:.3f}" in text
+    assert f"mean action {result['action_error']['mean_action']:.3f}" in text

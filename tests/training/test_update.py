@@ -1,0 +1,46 @@
+"""The meta-optimizer: what it does to a constant gradient is minus the learning rate."""
+
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from milx.config.presets import PRESETS
+from milx.config.schema import OptimizerConfig
+from milx.training.update import make_optimizer
+
+STEPS = 40
+
+
+def rates(config, gradient=1.0):
+    """Adam moves a parameter with a constant gradient by its learning rate, whatever the gradient is."""
+    optimizer = make_optimizer(config, STEPS)
+    state, moved = optimizer.init(jnp.zeros(())), []
+    for _ in range(STEPS):
+        update, state = optimizer.update(jnp.asarray(gradient), state)
+        moved.append(-float(update))
+    return np.array(moved)
+
+
+@pytest.mark.parametrize("warmup", [0.0, 0.25])
+@pytest.mark.parametrize("cosine", [False, True])
+def test_schedule(warmup, cosine):
+    config = OptimizerConfig(learning_rate=3e-3, warmup=warmup, cosine=cosine)
+    t, first = np.arange(STEPS), round(warmup * STEPS)
+    after = 0.5 * (1 + np.cos(np.pi * (t - first) / (STEPS - first))) if cosine else np.ones(STEPS)
+    expected = 3e-3 * np.where(t < first, t / max(first, 1), after)
+    np.testing.assert_allclose(rates(config), expected, rtol=1e-4, atol=1e-8)
+
+
+@pytest.mark.parametrize("preset", PRESETS["reach"])
+def test_every_preset_learns(preset):
+    config = PRESETS["reach"][preset]().optimizer
+    assert rates(config).max() == pytest.approx(config.learning_rate, rel=1e-3)
+
+
+def test_the_global_norm_is_clipped():
+    clipped = make_optimizer(OptimizerConfig(clip_norm=1.0), STEPS)
+    update, state = clipped.update(jnp.array([3.0, 4.0]), clipped.init(jnp.zeros(2)))
+    first_moment = optax.tree.get(state, "mu")
+    np.testing.assert_allclose(first_moment, 0.1 * np.array([0.6, 0.8]), rtol=1e-5)
+    assert update.shape == (2,)
