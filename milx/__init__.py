@@ -7,6 +7,7 @@ import importlib
 import importlib.metadata
 from types import ModuleType
 
+from milx.config.registry import register_env, register_method
 from milx.core.platform import configure
 from milx.deploy.policy import Policy
 from milx.deploy.pretrained import load
@@ -15,7 +16,19 @@ from milx.methods import METHODS
 from milx.types import Demo, Observation
 
 __version__ = importlib.metadata.version("milx")
-__all__ = ["ENVS", "METHODS", "Demo", "Observation", "Policy", "__version__", "configure", "load", "make"]
+__all__ = [
+    "ENVS",
+    "METHODS",
+    "Demo",
+    "Observation",
+    "Policy",
+    "__version__",
+    "configure",
+    "load",
+    "make",
+    "register_env",
+    "register_method",
+]
 
 
 def __getattr__(name: str) -> ModuleType:

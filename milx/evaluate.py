@@ -10,7 +10,7 @@ import sys
 
 from absl import app, flags, logging
 
-from milx.config import schema
+from milx.config import assemble
 from milx.core import platform
 from milx.training.factory import make_run
 
@@ -27,7 +27,7 @@ def main(argv: list[str]) -> None:
     if not path.is_file():
         sys.exit(f"milx: workdir: {path.parent} has no config.json, expected a folder of `python -m milx.train`")
     try:
-        run = make_run(schema.read(path), path.parent)
+        run = make_run(assemble.read(path), path.parent)
         run.report(run.evaluate())
     except (ValueError, OSError) as error:
         sys.exit(f"milx: {error}")

@@ -17,7 +17,7 @@ import numpy as np
 from gymnasium import spaces
 
 from milx import envs
-from milx.config.presets import make_config
+from milx.config.assemble import make_config
 from milx.config.schema import DataConfig
 from milx.data.simulated import render_demo
 from milx.envs.base import State

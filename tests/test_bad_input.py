@@ -19,9 +19,10 @@ from absl import flags
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from milx.config import schema
+from milx.config import assemble
+from milx.config.assemble import make_config
 from milx.config.check import check_config
-from milx.config.presets import PRESETS, make_config
+from milx.config.registry import PRESETS
 from milx.config.schema import GIVEN
 from milx.data import lerobot
 from milx.data.dataset import DataSet, Writer
@@ -135,17 +136,17 @@ JSON = st.recursive(
 def test_configs(data):
     """A field of a preset with any value: what is accepted comes back, and is a number where it must be one."""
     env = data.draw(st.sampled_from(sorted(PRESETS)))
-    values = schema.to_dict(make_config(env, preset="cpu"))
-    name = data.draw(st.sampled_from([*schema.flatten(values), "train", "nope"]))
+    values = assemble.to_dict(make_config(env, preset="cpu"))
+    name = data.draw(st.sampled_from([*assemble.flatten(values), "train", "nope"]))
     *path, last = name.split(".")
     group = values
     for part in path:
         group = group[part]
     group[last] = data.draw(st.one_of(JSON, st.just([3, 3]), st.just([0]), st.integers(1, 5)))
-    config = accepted(lambda: schema.from_dict(values))
+    config = accepted(lambda: assemble.from_dict(values))
     if config is not None:
-        assert schema.from_dict(json.loads(json.dumps(schema.to_dict(config)))) == config
-        for field, value in schema.flatten(schema.to_dict(config)).items():
+        assert assemble.from_dict(json.loads(json.dumps(assemble.to_dict(config)))) == config
+        for field, value in assemble.flatten(assemble.to_dict(config)).items():
             if isinstance(value, float):
                 assert np.isfinite(value), field
 
@@ -154,7 +155,7 @@ def test_configs(data):
 @given(data=st.data())
 def test_flags(data):
     """Flags and overrides with any text: a configuration that training would take, or an error that names the flag."""
-    fields = schema.flatten(schema.to_dict(make_config("reach", preset="cpu")))
+    fields = assemble.flatten(assemble.to_dict(make_config("reach", preset="cpu")))
     names = ["env", "method", "preset", "seed", "data", "nope", *(f"config.{name}" for name in (*fields, "nope"))]
     literal = JSON.map(repr)
     text = st.one_of(
@@ -171,7 +172,7 @@ def test_flags(data):
 
     config = accepted(parse)
     if config is not None:
-        assert schema.from_dict(schema.to_dict(config)) == config
+        assert assemble.from_dict(assemble.to_dict(config)) == config
 
 
 @pytest.fixture(scope="module")

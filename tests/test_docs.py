@@ -6,9 +6,7 @@ import re
 
 import pytest
 
-from milx import envs
-from milx.config.presets import PRESETS
-from milx.methods import METHODS
+from milx.config import registry
 
 DOCS = pathlib.Path(__file__).parents[1] / "docs"
 
@@ -17,12 +15,19 @@ def blocks(path, language):
     return re.findall(rf"^```{language}\n(.*?)^```", path.read_text(), re.MULTILINE | re.DOTALL)
 
 
+@pytest.fixture
+def registries():
+    """What the how-tos register is gone afterwards."""
+    before = [(each, dict(each)) for each in (registry.ENVS, registry.METHODS, registry.PRESETS)]
+    yield
+    for each, entries in before:
+        each.clear()
+        each.update(entries)
+
+
 @pytest.mark.parametrize("path", sorted(DOCS.glob("*.md")), ids=lambda path: path.stem)
-def test_the_blocks_of_a_how_to_run(path, tmp_path, monkeypatch, cache):
+def test_the_blocks_of_a_how_to_run(path, tmp_path, monkeypatch, cache, registries):
     monkeypatch.chdir(tmp_path)
-    for registry in (envs.ENVS, PRESETS, METHODS):
-        for name in ("beside", "nearest"):  # what the how-tos register is gone afterwards
-            monkeypatch.setitem(registry, name, None)
     scope = {"__name__": "__main__"}
     code = blocks(path, "python")
     assert code

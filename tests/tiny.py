@@ -2,7 +2,7 @@
 
 from rich.console import Console
 
-from milx.config.presets import make_config
+from milx.config.assemble import make_config
 from milx.config.schema import Config
 
 QUIET = Console(quiet=True)

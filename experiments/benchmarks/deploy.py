@@ -24,7 +24,7 @@ from absl import app, flags
 
 import milx
 from milx import envs, methods
-from milx.config.presets import make_config
+from milx.config.assemble import make_config
 from milx.data import episodes
 from milx.data.lerobot import LeRobot
 from milx.deploy.policy import Policy

@@ -14,7 +14,7 @@ from absl import app, flags
 
 import milx
 from milx import envs
-from milx.config.presets import make_config
+from milx.config.assemble import make_config
 
 _OUT = flags.DEFINE_string("out", str(common.RESULTS), "Folder of the JSON file.")
 _TINY = flags.DEFINE_bool("tiny", False, "One size of each, for a try.")
@@ -33,12 +33,12 @@ def main(_: list[str]) -> None:
     changes = [(name, size) for name, sizes in _SIZES.items() for size in sizes[: 1 if _TINY.value else None]]
     for name, size in [("meta-batch", 5), *changes]:
         config = make_config("reach", preset="paper")
-        config.train.meta_batch, config.train.imitation_steps = 5, 0
+        config.train.meta_batch, config.method.imitation_steps = 5, 0
         config.network.mixed_precision = common.ACCELERATED
         frames = size if name == "time steps" else config.train.support_frames
         config.train.support_frames = config.train.query_frames = frames
         config.train.meta_batch = size if name == "meta-batch" else config.train.meta_batch
-        config.mil.inner_steps = size if name == "inner steps" else config.mil.inner_steps
+        config.method.inner_steps = size if name == "inner steps" else config.method.inner_steps
         rows = size if name == "image rows" else config.env.image_shape[0]
         config.env.image_shape = (rows, rows * 5 // 4)
         report.measure(

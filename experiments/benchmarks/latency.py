@@ -18,7 +18,7 @@ from jax.experimental.compilation_cache import compilation_cache
 
 import milx
 from milx import envs, methods
-from milx.config.presets import make_config
+from milx.config.assemble import make_config
 from milx.config.schema import Config
 from milx.core import platform
 from milx.data.simulated import sampler

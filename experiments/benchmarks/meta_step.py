@@ -25,7 +25,7 @@ from absl import app, flags
 
 import milx
 from milx import envs, methods
-from milx.config.presets import make_config
+from milx.config.assemble import make_config
 from milx.config.schema import Config
 from milx.core import platform
 from milx.envs.base import Env

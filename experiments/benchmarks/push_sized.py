@@ -12,8 +12,9 @@ import jax.numpy as jnp
 import mujoco
 from mujoco import mjx
 
-from milx.config.schema import Config, DataConfig, EnvConfig, MILConfig, NetworkConfig, TrainConfig
+from milx.config.schema import Config, DataConfig, EnvConfig, NetworkConfig, TrainConfig
 from milx.envs.base import Env, State
+from milx.methods.mil import MILConfig
 
 _JOINTS = ("0 0 1", "0 1 0", "0 0 1", "0 1 0", "1 0 0", "0 1 0", "1 0 0")
 _THING = """

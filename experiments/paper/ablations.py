@@ -12,20 +12,20 @@ import options
 from absl import app, flags
 
 import milx
-from milx.config import schema
+from milx.config import assemble
 from milx.config.schema import Config
 
 ABLATIONS: dict[str, dict[str, Any]] = {
     "as it is": {},
     "5 shots at test": {"evaluation.shots": 5},
     "no bias transformation": {"network.bias_transformation": 0},
-    "first order": {"mil.first_order": True},
-    "fixed inner rate": {"mil.learn_inner_lr": False},
-    "3 inner steps": {"mil.inner_steps": 3},
-    "5 inner steps": {"mil.inner_steps": 5},
+    "first order": {"method.first_order": True},
+    "fixed inner rate": {"method.learn_inner_lr": False},
+    "3 inner steps": {"method.inner_steps": 3},
+    "5 inner steps": {"method.inner_steps": 5},
     "two heads": {"network.heads": 2},
     "convolutions in float32": {"network.mixed_precision": False},
-    "no goal head": {"network.goal_head": False, "mil.goal_weight": 0.0},
+    "no goal head": {"network.goal_head": False, "method.goal_weight": 0.0},
 }
 
 flags.adopt_module_key_flags(options)
@@ -36,7 +36,7 @@ def configure(changes: dict[str, Any], seed: int) -> Config:
     """A cell of figure 3 with some fields, by dotted name, changed."""
     config = cells.configure("reach", "mil", options.PRESET.value, seed, options.STEPS.value)
     for name, value in changes.items():
-        schema.assign(config, name, value)
+        assemble.assign(config, name, value)
     return config
 
 

@@ -19,8 +19,8 @@ import jax
 import jax.numpy as jnp
 
 from milx import envs, methods
-from milx.config import schema
-from milx.config.presets import make_config
+from milx.config import assemble
+from milx.config.assemble import make_config
 from milx.config.schema import Config
 from milx.core import platform, pytrees
 from milx.core.checkpoint import Checkpoints
@@ -127,8 +127,8 @@ class Cells:
         path = self.folder / f"{name}.json"
         if not path.is_file():
             return False
-        theirs = schema.from_dict(json.loads(path.read_text())["config"])
-        if changed := schema.differences(_contents(theirs), _contents(config)):
+        theirs = assemble.from_dict(json.loads(path.read_text())["config"])
+        if changed := assemble.differences(_contents(theirs), _contents(config)):
             raise ValueError(f"{path}: holds another cell: {'; '.join(changed)}")
         return True
 
@@ -269,7 +269,7 @@ class Cells:
 
     def _programs(self, config: Config) -> str:
         """All on which the compiled programs of training depend."""
-        values = schema.to_dict(config)
+        values = assemble.to_dict(config)
         del values["seed"], values["evaluation"], values["data"]["tasks"]
         return json.dumps(values)
 
@@ -291,7 +291,7 @@ class Cells:
 
 def _contents(config: Config) -> dict[str, Any]:
     """What makes a cell: how much runs at once does not."""
-    values = schema.to_dict(config)
+    values = assemble.to_dict(config)
     del values["evaluation"]["batch"], values["data"]["plan_batch"]
     return values
 

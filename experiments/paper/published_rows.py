@@ -2,8 +2,8 @@
 
 from typing import Any, NamedTuple
 
-from milx.config import schema
-from milx.config.presets import make_config
+from milx.config import assemble
+from milx.config.assemble import make_config
 from milx.config.schema import Config
 
 
@@ -32,7 +32,7 @@ def configure(row: Row, shots: int, seed: int) -> Config:
     config = make_config(row.env, row.method, "paper", seed)
     config.evaluation.shots = shots
     for name, value in row.changes.items():
-        schema.assign(config, name, value)
+        assemble.assign(config, name, value)
     return config
 
 
@@ -41,29 +41,26 @@ def _without(changes: dict[str, Any], *groups: str) -> dict[str, Any]:
     return {name: value for name, value in changes.items() if not name.startswith(groups)}
 
 
-RELEASED = {
-    "mil.whiten_actions": False,
-    "mil.loss_scale": 100.0,
-    "mil.inner_lr": 1e-3,
+_RAW = {"method.whiten_actions": False, "method.loss_scale": 100.0, "method.inner_lr": 1e-3}
+RELEASED = _RAW | {
     "network.fc_init_std": 0.01,
     "optimizer.warmup": 0.0,
     "optimizer.cosine": False,
     "optimizer.clip_norm": None,
-    "train.imitation_steps": 0,
+    "method.imitation_steps": 0,
 }
 """What turns reach's `paper` back into the numbers of the released code."""
-_RAW = {name: value for name, value in RELEASED.items() if name.startswith("mil.")}
 _AT_ONCE = {"env.action_cost": 1.0}
-_NO_IMITATION = {"train.imitation_steps": 0}
+_NO_IMITATION = {"method.imitation_steps": 0}
 _SHORT = {"train.steps": 5000, "train.eval_every": 1000}
 _PLATEAU = {
     "released": ("the released numbers", RELEASED),
-    "whitened": ("+ whitened actions", _without(RELEASED, "mil.")),
+    "whitened": ("+ whitened actions", _without(RELEASED, *_RAW)),
     "one-rate": (
         "+ whitened actions, the inner rate of the layers before the last",
-        _without(RELEASED, "mil.") | {"mil.inner_lr": 1.6e-3},
+        _without(RELEASED, *_RAW) | {"method.inner_lr": 1.6e-3},
     ),
-    "lecun": ("+ LeCun's start", _without(RELEASED, "mil.", "network.")),
+    "lecun": ("+ LeCun's start", _without(RELEASED, *_RAW, "network.")),
     "schedule": ("+ clip, warm-up, cosine", _NO_IMITATION),
     "imitation": ("+ imitation first: `paper`", {}),
     "raw": ("`paper` without whitened actions", _RAW),
@@ -75,12 +72,17 @@ _PLATEAU = {
     ),
     "at-once": ("`paper`, an expert that moves at once", _AT_ONCE),
     "at-once-schedule": ("the same without imitation first", _AT_ONCE | _NO_IMITATION),
-    "at-once-whitened": ("+ whitened actions alone, that expert", _AT_ONCE | _without(RELEASED, "mil.")),
+    "at-once-whitened": ("+ whitened actions alone, that expert", _AT_ONCE | _without(RELEASED, *_RAW)),
     "at-once-released": ("the released numbers, that expert", _AT_ONCE | RELEASED),
 }
 
-_VIDEO_STATE = {"mil.given": "video+state", "network.learned_loss": "linear"}
-_VIDEO = {"mil.given": "video", "network.learned_loss": "linear", "network.heads": 2, "network.inner_first_layer": True}
+_VIDEO_STATE = {"method.given": "video+state", "network.learned_loss": "linear"}
+_VIDEO = {
+    "method.given": "video",
+    "network.learned_loss": "linear",
+    "network.heads": 2,
+    "network.inner_first_layer": True,
+}
 _RESULTS = {
     "reach": Row("reach, vision", "reach", {}, "a curve"),
     "reach-state": Row("reach, states (three possible tasks)", "reach_state", {}, "a curve"),
@@ -95,7 +97,7 @@ _RESULTS = {
 _SLOWER = {"optimizer.learning_rate": 3e-4}
 _BASELINES = {
     f"{env}-{method}-{given.replace('+', '-')}": Row(
-        f"{env}, {label}, {given}", env, _SLOWER | {"mil.given": given}, published, shots, method
+        f"{env}, {label}, {given}", env, _SLOWER | {"method.given": given}, published, shots, method
     )
     for env, shots, method, label, given, published in (
         ("push", (1, 5), "lstm", "LSTM", "video+state+action", "78.4 / 83.1%"),
@@ -108,12 +110,12 @@ _BASELINES = {
     )
 }
 
-_GOAL_HEAD = {"network.goal_head": True, "mil.goal_weight": 1.0, "network.calibrate": False}
+_GOAL_HEAD = {"network.goal_head": True, "method.goal_weight": 1.0, "network.calibrate": False}
 _STEPS = {
     "reach": (
         ("sampled", "3 time steps of 64 tasks", _PLATEAU["three-frames"][1]),
         ("redrawn", "looks and distractors redrawn", {"train.redraw": True}),
-        ("rates", "learned inner rates", {"mil.learn_inner_lr": True}),
+        ("rates", "learned inner rates", {"method.learn_inner_lr": True}),
         (
             "network",
             "soft-argmax and the network of `fast`",
@@ -137,7 +139,7 @@ _STEPS = {
             {"train.support_frames": 4, "train.query_frames": 8, "train.meta_batch": 32},
         ),
         ("redrawn", "looks redrawn", {"train.redraw": True}),
-        ("rates", "learned inner rates", {"mil.learn_inner_lr": True}),
+        ("rates", "learned inner rates", {"method.learn_inner_lr": True}),
         (
             "network",
             "the network and rate of `fast`",
@@ -153,7 +155,7 @@ _STEPS = {
         (
             "fast",
             "30,000 updates, none without an inner step, clip 20: `fast`",
-            {"train.steps": 30_000, "mil.inner_clip": 20.0} | _NO_IMITATION,
+            {"train.steps": 30_000, "method.inner_clip": 20.0} | _NO_IMITATION,
         ),
     ),
 }
@@ -170,16 +172,16 @@ def _ladder() -> dict[str, Row]:
     return rows
 
 
-_TWO_STEPS = {"mil.inner_steps": 2}
+_TWO_STEPS = {"method.inner_steps": 2}
 _RELATIVES = {
     f"{env}-{name}": Row(f"{env}: {label}", env, changes | ({"network.heads": 1} if env == "push" else {}))
     for env in ("reach", "push")
     for name, label, changes in (
-        ("anil", "the last layer only (ANIL)", {"mil.variant": "anil"}),
-        ("boil", "all but the last layer (BOIL)", {"mil.variant": "boil"}),
-        ("cavia", "the bias transformation only (CAVIA)", {"mil.variant": "cavia"}),
+        ("anil", "the last layer only (ANIL)", {"method.variant": "anil"}),
+        ("boil", "all but the last layer (BOIL)", {"method.variant": "boil"}),
+        ("cavia", "the bias transformation only (CAVIA)", {"method.variant": "cavia"}),
         ("two-steps", "two inner steps", _TWO_STEPS),
-        ("multi-step", "two inner steps, the loss after each (MAML++)", _TWO_STEPS | {"mil.variant": "multi_step"}),
+        ("multi-step", "two inner steps, the loss after each (MAML++)", _TWO_STEPS | {"method.variant": "multi_step"}),
     )
 }
 

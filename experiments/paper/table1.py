@@ -36,7 +36,7 @@ TEMPORAL = {
     "train.steps": 15_000,
 }
 """The loss that convolves over time sees all frames, so it trains with a quarter of the tasks and half the updates."""
-HINDSIGHT = {"mil.given": "video", "network.learned_loss": "linear", "network.hindsight_head": True}
+HINDSIGHT = {"method.given": "video", "network.learned_loss": "linear", "network.hindsight_head": True}
 """Beyond the paper: where the robot went is read off the video."""
 
 
@@ -49,15 +49,14 @@ def _rows() -> dict[str, Row]:
     for given in GIVEN:
         name, shown = given.replace("+", "-"), given.replace("+", " + ")
         for method in cells.METHODS["push"]:
-            learned = "linear" if method == "mil" and given != GIVEN[0] else None
-            changes = {"mil.given": given, "network.learned_loss": learned}
-            add(f"{method}-{name}", f"{LABELS[method]}, {shown}", method, changes)
+            learned = {"network.learned_loss": "linear"} if method == "mil" and given != GIVEN[0] else {}
+            add(f"{method}-{name}", f"{LABELS[method]}, {shown}", method, {"method.given": given} | learned)
         if given != GIVEN[0]:
             add(
                 f"mil-temporal-{name}",
                 f"{LABELS['mil']}, temporal loss, {shown}",
                 "mil",
-                {"mil.given": given, **TEMPORAL},
+                {"method.given": given, **TEMPORAL},
             )
     add("mil-hindsight-video", "MIL + goal and hindsight heads, video", "mil", HINDSIGHT)
     add(

@@ -17,7 +17,7 @@ TABLE = Table(
     {
         "mil": Row("MIL + goal head", "mil", {}, "90%"),
         "mil-video": Row(
-            "MIL + goal head, video", "mil", {"mil.given": "video", "network.learned_loss": "linear"}, "68.3%"
+            "MIL + goal head, video", "mil", {"method.given": "video", "network.learned_loss": "linear"}, "68.3%"
         ),
         "mil-ten-times": Row("MIL + goal head, ten times as many demonstrations", "mil", {"data.tasks": 1500}),
         "lstm": Row("LSTM + goal head", "lstm", {}, "25%"),

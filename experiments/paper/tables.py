@@ -8,7 +8,7 @@ import options
 from absl import flags
 
 import milx
-from milx.config import schema
+from milx.config import assemble
 from milx.config.schema import Config
 from milx.evaluation.results import intervals
 
@@ -54,7 +54,7 @@ def configure(env: str, row: Row, shots: int, seed: int) -> Config:
     config.train.redraw = True
     config.evaluation.shots = shots
     for name, value in row.changes.items():
-        schema.assign(config, name, value)
+        assemble.assign(config, name, value)
     return config
 
 

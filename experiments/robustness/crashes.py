@@ -21,7 +21,7 @@ import numpy as np
 from absl import app, flags, logging
 from rich.console import Console
 
-from milx.config import schema
+from milx.config import assemble
 from milx.core import pytrees
 from milx.core.checkpoint import Checkpoints
 from milx.data.dataset import Writer
@@ -65,7 +65,7 @@ def finish(data: pathlib.Path, workdir: pathlib.Path) -> str:
     out, _ = process.communicate()
     if process.returncode:
         raise RuntimeError(out[-2000:])
-    run = RecordedRun(schema.read(workdir / "config.json"), workdir, Console(quiet=True))
+    run = RecordedRun(assemble.read(workdir / "config.json"), workdir, Console(quiet=True))
     checkpoints = Checkpoints(workdir / "checkpoints", read_only=True)
     params = policy.load(workdir).params
     trainer = jax.ShapeDtypeStruct((), np.int32), jax.eval_shape(run.trainer.optimizer.init, params)

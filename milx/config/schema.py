@@ -1,24 +1,23 @@
-"""Every hyperparameter, as plain dataclasses.
+"""Every hyperparameter, as plain dataclasses; fields say the least and the greatest number that they may hold.
 
-`milx.config.presets.make_config` fills them; a launcher's `--config.path.to.field=value` overrides one field.
+Two groups depend on the method: `Config.network` and `Config.method` are the classes that it was registered with
+(`milx.config.registry`), which extend `NetworkConfig` and `MethodConfig`. A launcher's `--config.path.to.field=value`
+overrides one field.
 """
 
 import dataclasses
-import functools
-import json
-import pathlib
-import typing
+import math
 from typing import Any
-
-from milx.config.check import check_config
 
 GIVEN = ("video+state+action", "video+state", "video")
 """What a demonstration can show of a new task."""
+LARGEST_SIZE = 1 << 14
+"""Of a layer, or of a side of an image: more is a slip of the finger."""
 
-VARIANTS = ("maml", "anil", "boil", "cavia", "multi_step")
-"""Relatives of MAML (Finn et al. 2017): the inner step changes the last layer only (ANIL, Raghu et al. 2020), all but
-the last (BOIL, Oh et al. 2021) or the bias transformation only (CAVIA, Zintgraf et al. 2019); or the loss after every
-inner step counts (MAML++, Antoniou et al. 2019)."""
+
+def number(default: Any, low: float = 1, high: float = math.inf) -> Any:
+    """A field of numbers, or of a tuple of them, that lie between `low` and `high`; other fields are counts, from 1."""
+    return dataclasses.field(default=default, metadata={"low": low, "high": high})
 
 
 @dataclasses.dataclass
@@ -31,8 +30,8 @@ class EnvConfig:
             expert moves at once and fast, and its first actions tell where it goes; None for the environment's own.
     """
 
-    image_shape: tuple[int, int] = (64, 80)
-    action_cost: float | None = None
+    image_shape: tuple[int, int] = number((64, 80), 1, 4096)
+    action_cost: float | None = number(None, 0)
 
 
 @dataclasses.dataclass
@@ -51,9 +50,9 @@ class DataConfig:
 
     tasks: int = 1500
     demos_per_task: int = 10
-    noise: float = 0.01
-    spare_demos: int = 0
-    plan_iterations: int = 16
+    noise: float = number(0.01, 0)
+    spare_demos: int = number(0, 0, 1000)
+    plan_iterations: int = number(16, 0, 10_000)
     plan_batch: int = 4096
 
 
@@ -69,14 +68,14 @@ class RecordedConfig:
     """
 
     path: str = ""
-    horizon: int = 50
-    goal_indices: tuple[int, ...] = ()
-    gib: float = 2.0
+    horizon: int = number(50, 1, 100_000)
+    goal_indices: tuple[int, ...] = number((), 0, 100_000)
+    gib: float = number(2.0, 0, 100_000)
 
 
 @dataclasses.dataclass
 class NetworkConfig:
-    """The policy network.
+    """The networks of all methods: convolutions, then fully connected layers that also see the robot's state.
 
     Attributes:
         filters: output channels of each convolution.
@@ -91,72 +90,40 @@ class NetworkConfig:
         fc_layers: sizes of the hidden fully connected layers.
         fc_norm: layer norm in the hidden fully connected layers.
         fc_init_std: standard deviation of their first weights; None for LeCun's initialisation.
-        bias_transformation: size of the learned vector beside the first fully connected layer's input; 0 for none.
-        heads: 1, or 2 for a separate output layer in the inner loss.
-        inner_first_layer: a first fully connected layer of its own in the inner loss, as in the released code where
-            demonstrations are video alone.
         goal_head: predict where the episode ends, from the image, or from the state where the policy sees no pixels,
             and show the prediction to the layers after it (`milx.networks.goal`).
         calibrate: start the goal head's votes from the camera's calibration, where it is known.
-        target_head: predict where the episode ends with a linear layer from the first image's features, and show the
-            prediction to the layers after it, as the paper does (Section 6.3); its squared error joins all losses.
-        hindsight_head: where a demonstration is video alone, learn to tell from its first and last image what the goal
-            head is to see in the first, and let that be the goal in the inner step.
-        learned_loss: MIL's inner loss where demonstrations show no actions (`mil.given`): "linear", or "temporal" with
-            convolutions over time (`milx.networks.learned_loss`); None where they show them.
-        context: size of the vector that methods without adaptation keep of a demonstration: units of the LSTM.
-        context_frames: time steps of a demonstration that an LSTM reads.
     """
 
-    filters: tuple[int, ...] = (40, 40, 40)
-    strides: tuple[int, ...] = (2, 2, 2)
-    kernel: int = 3
+    filters: tuple[int, ...] = number((40, 40, 40), 1, LARGEST_SIZE)
+    strides: tuple[int, ...] = number((2, 2, 2), 1, 64)
+    kernel: int = number(3, 1, 64)
     fixed_filters: str | None = None
     mixed_precision: bool = False
     rematerialise: bool = False
     soft_argmax: bool = False
-    fc_layers: tuple[int, ...] = (200, 200, 200, 200)
+    fc_layers: tuple[int, ...] = number((200, 200, 200, 200), 1, LARGEST_SIZE)
     fc_norm: bool = True
-    fc_init_std: float | None = None
-    bias_transformation: int = 10
-    heads: int = 1
-    inner_first_layer: bool = False
+    fc_init_std: float | None = number(None, 0)
     goal_head: bool = False
     calibrate: bool = True
-    target_head: bool = False
-    hindsight_head: bool = False
-    learned_loss: str | None = None
-    context: int = 512
-    context_frames: int = 10
 
 
 @dataclasses.dataclass
-class MILConfig:
-    """Meta-imitation learning (paper, Section 4); the last four hold for all methods.
+class MethodConfig:
+    """What holds for all methods.
 
     Attributes:
-        inner_steps: gradient steps of an adaptation.
-        inner_lr: their learning rate alpha.
-        learn_inner_lr: meta-learn a factor on alpha for every tensor.
-        inner_clip: bound on each entry of the inner gradient.
-        first_order: do not differentiate through the inner gradient.
-        variant: one of VARIANTS: what the inner step changes, or which of its results the meta-objective sees.
         loss_scale: m; errors of the actions are multiplied by it before they are squared.
         whiten_actions: let the network predict actions with zero mean and unit variance.
         goal_weight: weight of the goal head's negative log likelihoods, or of the target head's squared error.
         given: what a policy is shown of a new task: one of GIVEN. Queries, in meta-training, show everything.
     """
 
-    inner_steps: int = 1
-    inner_lr: float = 1e-3
-    learn_inner_lr: bool = False
-    inner_clip: float = 20.0
-    first_order: bool = False
-    variant: str = "maml"
-    loss_scale: float = 1.0
+    loss_scale: float = number(1.0, 0)
     whiten_actions: bool = False
-    goal_weight: float = 0.0
-    given: str = "video+state+action"
+    goal_weight: float = number(0.0, 0)
+    given: str = GIVEN[0]
 
 
 @dataclasses.dataclass
@@ -165,15 +132,15 @@ class OptimizerConfig:
 
     Attributes:
         learning_rate: its peak.
-        warmup: part of the run that warms up linearly from zero.
+        warmup: fraction of the run that warms up linearly from zero.
         cosine: decay to zero along a cosine over the run; constant otherwise.
         clip_norm: bound on the global norm of the meta-gradient; None for none.
     """
 
-    learning_rate: float = 1e-3
-    warmup: float = 0.0
+    learning_rate: float = number(1e-3, 0)
+    warmup: float = number(0.0, 0, 1)
     cosine: bool = False
-    clip_norm: float | None = None
+    clip_norm: float | None = number(None, 0)
 
 
 @dataclasses.dataclass
@@ -182,7 +149,6 @@ class TrainConfig:
 
     Attributes:
         steps: meta-updates.
-        imitation_steps: so many of them, the first, imitate all demonstrations without an inner step (MIL only).
         meta_batch: tasks in a meta-batch.
         shots: support demonstrations of each task.
         support_frames: time steps drawn from each support demonstration; None for all.
@@ -194,7 +160,6 @@ class TrainConfig:
     """
 
     steps: int = 30_000
-    imitation_steps: int = 0
     meta_batch: int = 5
     shots: int = 1
     support_frames: int | None = None
@@ -227,89 +192,17 @@ class EvalConfig:
 
 @dataclasses.dataclass
 class Config:
-    """A whole run."""
+    """A whole run; `milx.config.assemble` puts it together."""
 
-    env_name: str = "reach"
-    method_name: str = "mil"
-    preset: str = "paper"
-    seed: int = 0
+    env_name: str
+    method_name: str
+    preset: str
+    seed: int = number(0, 0, 2**32 - 1)
     env: EnvConfig = dataclasses.field(default_factory=EnvConfig)
     data: DataConfig = dataclasses.field(default_factory=DataConfig)
     recorded: RecordedConfig = dataclasses.field(default_factory=RecordedConfig)
     network: NetworkConfig = dataclasses.field(default_factory=NetworkConfig)
-    mil: MILConfig = dataclasses.field(default_factory=MILConfig)
+    method: MethodConfig = dataclasses.field(default_factory=MethodConfig)
     optimizer: OptimizerConfig = dataclasses.field(default_factory=OptimizerConfig)
     train: TrainConfig = dataclasses.field(default_factory=TrainConfig)
     evaluation: EvalConfig = dataclasses.field(default_factory=EvalConfig)
-
-
-def to_dict(config: Config) -> dict[str, Any]:
-    """The configuration as nested dictionaries that JSON can hold."""
-    return dataclasses.asdict(config)
-
-
-def from_dict(values: dict[str, Any]) -> Config:
-    """The inverse of `to_dict`, also after a trip through JSON.
-
-    Raises:
-        ValueError: for a field that does not exist (the message lists those that do), or has a value that it cannot.
-    """
-    config = _build(Config, values, "config")
-    check_config(config)
-    return config
-
-
-def read(path: pathlib.Path) -> Config:
-    """The configuration in a JSON file.
-
-    Raises:
-        ValueError: if it holds none; the message names the file.
-    """
-    try:
-        return from_dict(json.loads(path.read_text()))
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: expected a configuration: {error}") from error
-
-
-def flatten(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested dictionaries as one, with dotted names."""
-    flat: dict[str, Any] = {}
-    for name, value in values.items():
-        flat |= flatten(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
-    return flat
-
-
-def differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
-    """Where two configurations of `to_dict` differ, a line each."""
-    before, after = flatten(old), flatten(new)
-    return [f"{name} was {before[name]}, now {after[name]}" for name in before if before[name] != after[name]]
-
-
-def assign(config: Config, field: str, value: Any) -> None:
-    """Sets the field with this dotted name.
-
-    Raises:
-        ValueError: if there is no such field, or the value is None and the field cannot be.
-    """
-    if field not in flatten(to_dict(config)):
-        raise ValueError(f"config.{field}: no such field")
-    *path, name = field.split(".")
-    holder: Any = functools.reduce(getattr, path, config)
-    if value is None and type(None) not in typing.get_args(typing.get_type_hints(type(holder))[name]):
-        raise ValueError(f"config.{field}: got None, expected a value")
-    setattr(holder, name, value)
-
-
-def _build(cls: type, values: dict[str, Any], path: str) -> Any:
-    types = typing.get_type_hints(cls)
-    if not isinstance(values, dict) or not all(isinstance(name, str) for name in values):
-        raise ValueError(f"{path}: got {values!r}, expected a group of fields")
-    unknown = sorted(set(values) - set(types))
-    if unknown:
-        raise ValueError(f"{path}: no such field {unknown[0]!r}, expected one of {', '.join(types)}")
-    built = {}
-    for name, value in values.items():
-        if dataclasses.is_dataclass(types[name]):
-            value = _build(typing.cast(type, types[name]), value, f"{path}.{name}")
-        built[name] = tuple(value) if isinstance(value, list) else value
-    return cls(**built)

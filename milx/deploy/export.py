@@ -92,7 +92,7 @@ def input_shapes(policy: Policy, shots: int) -> dict[str, dict[str, list[int]]]:
     if spec.image_shape is not None:
         seen["image"] = [*spec.image_shape, 3]
     shown = seen | {"action": [spec.action_size]}
-    hidden = {GIVEN[0]: (), GIVEN[1]: ("action",), GIVEN[2]: ("action", "state")}[config.mil.given]
+    hidden = {GIVEN[0]: (), GIVEN[1]: ("action",), GIVEN[2]: ("action", "state")}[config.method.given]
     adapt = {name: [shots, horizon, *shape] for name, shape in shown.items() if name not in hidden}
     return {"adapt": adapt, "act": seen}
 

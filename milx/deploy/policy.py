@@ -10,8 +10,8 @@ import jax
 import numpy as np
 
 from milx import envs, methods
-from milx.config import schema
-from milx.config.schema import GIVEN
+from milx.config import assemble
+from milx.config.schema import GIVEN, Config
 from milx.core.checkpoint import Checkpoints
 from milx.data.goals import goals
 from milx.methods import Method
@@ -36,7 +36,7 @@ class Policy:
     method: Method
     spec: Spec
     params: Params
-    config: schema.Config
+    config: Config
 
     def adapt(self, params: Params, demo: Demo) -> Params:
         """Learns a task from one demonstration [T, ...] or several [K, T, ...]; jitted.
@@ -53,7 +53,7 @@ class Policy:
             ValueError: for a field that is missing, not wanted, or of a wrong shape or type, a value that is not
                 finite, or an action that the environment does not allow.
         """
-        return self._adapt(params, check_demo(demo, self.spec, self.config.mil.given))
+        return self._adapt(params, check_demo(demo, self.spec, self.config.method.given))
 
     def act(self, task_params: Params, observation: Observation) -> jax.Array:
         """The action [A], in the environment's units, for one observation; jitted.
@@ -106,7 +106,7 @@ def load(run: str | pathlib.Path) -> Policy:
     path = folder / "config.json"
     if not path.is_file():
         raise ValueError(f"run: {folder} has no config.json, expected a folder written by `python -m milx.train`")
-    config = schema.read(path)
+    config = assemble.read(path)
     if (folder / SPEC_FILE).is_file():
         try:
             spec = Spec.from_dict(json.loads((folder / SPEC_FILE).read_text()))

@@ -5,7 +5,7 @@ import pathlib
 from typing import Any
 
 from milx import envs, methods
-from milx.config import schema
+from milx.config import assemble
 from milx.core import pytrees
 from milx.deploy import policy
 from milx.deploy.policy import Policy
@@ -39,7 +39,7 @@ def load(run: str | pathlib.Path) -> Policy:
     if run not in names():
         expected = f"the folder of a run, or one of {', '.join(names())}, which ship with milx"
         raise ValueError(f"run: got {str(run)!r}, expected {expected}")
-    config = schema.from_dict(result(str(run))["config"])
+    config = assemble.from_dict(result(str(run))["config"])
     spec = envs.make(config.env_name, config.env.image_shape, config.env.action_cost).spec
     method = methods.make(config, spec)
     params = pytrees.load(FOLDER / run / "params.npz", like=params_like(method, spec))

@@ -1,13 +1,21 @@
 """Environments by name."""
 
+from milx.config.registry import ENVS, register_env, register_presets
 from milx.envs.base import Env, State, Task
 from milx.envs.place.env import Place
+from milx.envs.place.presets import PLACE
 from milx.envs.push.env import Push
-from milx.envs.reach import Reach, ReachState
-
-ENVS: dict[str, type[Env]] = {env.name: env for env in (Reach, ReachState, Push, Place)}
+from milx.envs.push.presets import PUSH, RECORDED
+from milx.envs.reach.env import Reach, ReachState
+from milx.envs.reach.presets import REACH, REACH_STATE
 
 __all__ = ["ENVS", "Env", "State", "Task", "make"]
+
+register_env(Reach, REACH)
+register_env(ReachState, REACH_STATE)
+register_env(Push, PUSH)
+register_env(Place, PLACE)
+register_presets("recorded", RECORDED)
 
 
 def make(name: str, image_shape: tuple[int, int] | None = None, action_cost: float | None = None) -> Env:
@@ -23,7 +31,7 @@ def make(name: str, image_shape: tuple[int, int] | None = None, action_cost: flo
     """
     if name not in ENVS:
         raise ValueError(f"env: got {name!r}, expected one of {', '.join(ENVS)}")
-    env = ENVS[name](image_shape)
+    env: Env = ENVS[name](image_shape)
     if action_cost is not None:
         env.action_cost = action_cost
     return env

@@ -238,7 +238,7 @@ def describe(env: Env, config: Config, task: Task, trials: Trials, misled: Trial
         "num_tasks_train": config.data.tasks,
         "num_demos_train": config.data.tasks * config.data.demos_per_task,
         "shots": config.evaluation.shots,
-        "given": config.mil.given if env.vision else config.mil.given.removeprefix("video+"),
+        "given": config.method.given if env.vision else config.method.given.removeprefix("video+"),
         "trials": int(trials.success.size),
         **judged(trials.success, floors.success, misled.success),
         "criterion": env.criterion,

@@ -78,7 +78,7 @@ def advice(has_inner_step: bool) -> str:
     """What a run says that does not listen, and what to try."""
     remedies = "more tasks in a meta-batch (train.meta_batch), or whitened actions (mil.whiten_actions)"
     if has_inner_step:
-        remedies = f"imitation before the first inner step (train.imitation_steps), another mil.inner_lr, {remedies}"
+        remedies = f"imitation first (method.imitation_steps), another method.inner_lr, {remedies}"
     return f"the policy does not listen: another task's demonstration does as well as its own. Try {remedies}"
 
 

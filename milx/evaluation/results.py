@@ -5,7 +5,7 @@ import os
 import pathlib
 from typing import Any
 
-from milx.config import presets, schema
+from milx.config import assemble
 from milx.config.schema import Config
 from milx.evaluation import provenance
 
@@ -26,12 +26,12 @@ def describe(
         "env": config.env_name,
         "method": config.method_name,
         "preset": config.preset,
-        "variant": ", ".join(f"{name}={value}" for name, value in presets.overrides(config).items()),
+        "variant": ", ".join(f"{name}={value}" for name, value in assemble.overrides(config).items()),
         "seed": config.seed,
         **found,
         "wall_clock_s": seconds,
         "steps": step,
-        "config": schema.to_dict(config),
+        "config": assemble.to_dict(config),
         "dataset_hash": dataset_hash,
         **provenance.describe(),
     }

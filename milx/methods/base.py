@@ -14,6 +14,11 @@ class Method(abc.ABC):
     `params` is what meta-training learns; `task_params` is what the policy needs once it has seen a demonstration.
     """
 
+    @property
+    def imitation_steps(self) -> int:
+        """How many meta-updates, the first, minimise `imitation` instead of `loss`."""
+        return 0
+
     @abc.abstractmethod
     def init(self, key: jax.Array, whitening: Whitening) -> Params:
         """Draws the parameters at the start of meta-training; they carry the whitening of states and actions."""
@@ -28,7 +33,7 @@ class Method(abc.ABC):
         """
 
     def imitation(self, params: Params, batch: TaskBatch) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """As `loss`, but without an inner step, to start from; for methods that have one (`TrainConfig`)."""
+        """As `loss`, but without an inner step, to start from; for methods that have one (`imitation_steps`)."""
         raise NotImplementedError
 
     @abc.abstractmethod

@@ -6,12 +6,21 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from milx.config.schema import MILConfig
+from milx.config.schema import Config, MethodConfig
 from milx.methods.base import Method
-from milx.methods.imitation import behavioural_cloning, calibrate_goal_head, flat, shown
+from milx.methods.imitation import behavioural_cloning, calibrate_goal_head, calibration, flat, shown
 from milx.methods.whitening import Whitening
-from milx.networks.encoders import ContextNetwork
-from milx.types import Demo, Memory, Observation, Params, TaskBatch
+from milx.networks.attention import AttentiveActor, ObjectTokens
+from milx.networks.encoders import (
+    Actor,
+    ContextConfig,
+    ContextNetwork,
+    LastFrame,
+    Recurrent,
+    RecurrentConfig,
+    make_context_network,
+)
+from milx.types import Demo, Memory, Observation, Params, Spec, TaskBatch
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -27,7 +36,7 @@ class ContextPolicy(Method):
         goal_indices, image_to_goal: as in `MIL`.
     """
 
-    config: MILConfig
+    config: MethodConfig
     network: ContextNetwork
     goal_indices: tuple[int, ...] = ()
     image_to_goal: tuple[tuple[float, ...], ...] | None = None
@@ -74,3 +83,35 @@ class ContextPolicy(Method):
         state = whitening.state(batch.state)
         apply = jax.vmap(lambda context: self.network.apply(task_params, context, batch.image, state).action[0])
         return whitening.unwhiten_action(apply(task_params["context"]).mean(axis=0)), memory
+
+
+def make_contextual(config: Config, spec: Spec) -> ContextPolicy:
+    """Builds the policy that sees a demonstration's last frame."""
+    assert isinstance(config.network, ContextConfig)
+    return _with_context(config, spec, LastFrame(config.network))
+
+
+def make_lstm(config: Config, spec: Spec) -> ContextPolicy:
+    """Builds the policy whose LSTM reads a demonstration."""
+    assert isinstance(config.network, RecurrentConfig)
+    return _with_context(config, spec, Recurrent(config.network))
+
+
+def make_lstm_attention(config: Config, spec: Spec) -> ContextPolicy:
+    """Builds the policy that attends to a demonstration and to the objects.
+
+    Raises:
+        ValueError: where the state does not tell where the objects are.
+    """
+    assert isinstance(config.network, ContextConfig)
+    if not spec.object_indices:
+        expected = "another: the state does not tell where the objects are"
+        raise ValueError(f"method: got 'lstm_attention', expected {expected}")
+    actor = AttentiveActor(config.network, spec.action_size, spec.object_indices)
+    return _with_context(config, spec, ObjectTokens(config.network, spec.object_indices), actor)
+
+
+def _with_context(config: Config, spec: Spec, encoder: Any, actor: Any = None) -> ContextPolicy:
+    actor = actor or Actor(config.network, spec.action_size, goal_size=len(spec.goal_indices))
+    network = make_context_network(encoder, actor, spec.image_shape, spec.state_size, spec.action_size)
+    return ContextPolicy(config.method, network, spec.goal_indices, calibration(config, spec))

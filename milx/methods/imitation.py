@@ -6,15 +6,15 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-from milx.config.schema import GIVEN, MILConfig
+from milx.config.schema import GIVEN, Config, MethodConfig
 from milx.methods.whitening import Whitening
 from milx.networks.goal import Goal, calibrate
 from milx.networks.policy_network import PolicyOutput
-from milx.types import Demo, Params
+from milx.types import Demo, Params, Spec
 
 
 def shown(demo: Demo, given: str, whitening: Whitening) -> Demo:
-    """Demonstrations [K, T, ...] without what is not `given` (`MILConfig.given`): their mean stands in its place."""
+    """Demonstrations [K, T, ...] without what is not `given` (`MethodConfig.given`): their mean stands in its place."""
     if given == GIVEN[0]:
         return demo
     shape = (demo.state if demo.image is None else demo.image).shape[:2]
@@ -31,7 +31,7 @@ def flat(demo: Demo) -> Demo:
 
 
 def behavioural_cloning(
-    config: MILConfig,
+    config: MethodConfig,
     output: PolicyOutput,
     action: jax.Array,
     demo: Demo,
@@ -93,6 +93,12 @@ def _mean_where_known(
     known = jnp.isfinite(white).all(axis=-1)
     errors = error(jnp.where(known[:, None], white, 0.0))
     return jnp.where(known, errors, 0.0).sum() / jnp.maximum(known.sum(), 1)
+
+
+def calibration(config: Config, spec: Spec) -> tuple[tuple[float, ...], ...] | None:
+    """The camera's calibration (`Spec.image_to_goal`), if goal heads are to start from it."""
+    calibrated = config.network.goal_head and config.network.calibrate and spec.image_shape is not None
+    return spec.image_to_goal if calibrated else None
 
 
 def calibrate_goal_head(

@@ -18,13 +18,50 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from milx.config.schema import MILConfig
+from milx.config.schema import GIVEN, Config, MethodConfig, number
 from milx.methods.base import Method
-from milx.methods.imitation import behavioural_cloning, calibrate_goal_head, flat, goal_loss, head_losses, shown
+from milx.methods.imitation import (
+    behavioural_cloning,
+    calibrate_goal_head,
+    calibration,
+    flat,
+    goal_loss,
+    head_losses,
+    shown,
+)
 from milx.methods.whitening import Whitening
 from milx.networks.goal import Goal
-from milx.networks.policy_network import BIAS_TRANSFORMATION, PolicyNetwork, PolicyOutput
-from milx.types import Demo, Memory, Observation, Params, TaskBatch
+from milx.networks.learned_loss import KINDS
+from milx.networks.policy_network import BIAS_TRANSFORMATION, PolicyConfig, PolicyNetwork, PolicyOutput, make_policy
+from milx.types import Demo, Memory, Observation, Params, Spec, TaskBatch
+
+VARIANTS = ("maml", "anil", "boil", "cavia", "multi_step")
+"""Relatives of MAML (Finn et al. 2017): the inner step changes the last layer only (ANIL, Raghu et al. 2020), all but
+the last (BOIL, Oh et al. 2021) or the bias transformation only (CAVIA, Zintgraf et al. 2019); or the loss after every
+inner step counts (MAML++, Antoniou et al. 2019)."""
+
+
+@dataclasses.dataclass
+class MILConfig(MethodConfig):
+    """Meta-imitation learning (paper, Section 4).
+
+    Attributes:
+        inner_steps: gradient steps of an adaptation.
+        inner_lr: their learning rate alpha.
+        learn_inner_lr: meta-learn a factor on alpha for every tensor.
+        inner_clip: bound on each entry of the inner gradient.
+        first_order: do not differentiate through the inner gradient.
+        variant: one of VARIANTS: what the inner step changes, or which of its results the meta-objective sees.
+        imitation_steps: so many meta-updates, the first, imitate all demonstrations without an inner step.
+    """
+
+    inner_steps: int = number(1, 0, 1000)
+    inner_lr: float = number(1e-3, 0)
+    learn_inner_lr: bool = False
+    inner_clip: float = number(20.0, 0)
+    first_order: bool = False
+    variant: str = "maml"
+    imitation_steps: int = number(0, 0)
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
@@ -72,6 +109,11 @@ class MIL(Method):
     network: PolicyNetwork
     goal_indices: tuple[int, ...] = ()
     image_to_goal: tuple[tuple[float, ...], ...] | None = None
+
+    @property
+    def imitation_steps(self) -> int:
+        """See `MILConfig`."""
+        return self.config.imitation_steps
 
     def init(self, key: jax.Array, whitening: Whitening) -> Params:
         """Draws the network's parameters."""
@@ -224,3 +266,50 @@ class MIL(Method):
         output = self._apply(theta, whitening, demo)
         action = output.inner_action if inner else output.action
         return behavioural_cloning(self.config, output, action, demo, whitening, self.goal_indices)
+
+
+def make_mil(config: Config, spec: Spec) -> MIL:
+    """Builds MIL.
+
+    Raises:
+        ValueError: for settings that do not fit together, or do not fit what demonstrations show.
+    """
+    network, settings = config.network, config.method
+    assert isinstance(network, PolicyConfig) and isinstance(settings, MILConfig)
+    _check_variant(settings, network, config.train.steps)
+    _check_inner_loss(settings, network, has_goal_head=bool(network.goal_head and spec.goal_indices))
+    policy = make_policy(network, spec.image_shape, spec.state_size, spec.action_size, len(spec.goal_indices))
+    return MIL(settings, policy, spec.goal_indices, calibration(config, spec))
+
+
+def _check_variant(settings: MILConfig, network: PolicyConfig, steps: int) -> None:
+    """Raises ValueError for a relative of MAML that does not exist, or has nothing to adapt or to count."""
+    variant, inner_steps = settings.variant, settings.inner_steps
+    if variant not in VARIANTS:
+        raise ValueError(f"method.variant: got {variant!r}, expected one of {', '.join(VARIANTS)}")
+    if variant == "cavia" and not network.bias_transformation:
+        expected = "at least 1: method.variant='cavia' adapts it alone"
+        raise ValueError(f"network.bias_transformation: got 0, expected {expected}")
+    if variant == "anil" and (network.heads == 2 or network.learned_loss):
+        expected = "one that acts and has the inner loss: method.variant='anil' adapts it alone"
+        got = f"got {network.heads} with network.learned_loss={network.learned_loss!r}"
+        raise ValueError(f"network.heads: {got}, expected {expected}")
+    if variant == "multi_step" and inner_steps < 2:
+        expected = "at least 2: method.variant='multi_step' counts them all"
+        raise ValueError(f"method.inner_steps: got {inner_steps}, expected {expected}")
+    if settings.imitation_steps >= steps:
+        got = f"got {settings.imitation_steps}"
+        raise ValueError(f"method.imitation_steps: {got}, expected less than train.steps = {steps}")
+
+
+def _check_inner_loss(settings: MILConfig, network: PolicyConfig, has_goal_head: bool) -> None:
+    """Raises ValueError where what demonstrations show does not fit the inner loss."""
+    given, learned = settings.given, network.learned_loss
+    if network.hindsight_head and not (has_goal_head and given == "video"):
+        expected = "False: it is for a goal head, from video alone (method.given)"
+        raise ValueError(f"network.hindsight_head: got True, expected {expected}")
+    if learned not in (None, *KINDS):
+        raise ValueError(f"network.learned_loss: got {learned!r}, expected None or one of {', '.join(KINDS)}")
+    if (learned is None) != (given == GIVEN[0]):
+        expected = "None: the actions are shown" if learned else f"one of {', '.join(KINDS)}: no actions are shown"
+        raise ValueError(f"network.learned_loss: got {learned!r} with method.given={given!r}, expected {expected}")

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from milx.config.schema import NetworkConfig
+from milx.networks.encoders import ContextConfig
 from milx.networks.layers import Dense
 from milx.networks.policy_network import Controller, PolicyOutput
 
@@ -47,7 +48,7 @@ class ObjectTokens(nn.Module):
 class AttentiveActor(nn.Module):
     """Acts on what it reads from the tokens. The weights of both attentions are sown as "intermediates"."""
 
-    config: NetworkConfig
+    config: ContextConfig
     action_size: int
     object_indices: tuple[tuple[int, ...], ...]
 

@@ -4,6 +4,7 @@
 first to the last, with states and actions. The network that acts is the same for both, and MIL's but for the vector.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -12,11 +13,33 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from milx.config.schema import NetworkConfig
+from milx.config.schema import LARGEST_SIZE, NetworkConfig, number
 from milx.networks.goal import StateGoalHead
 from milx.networks.layers import Dense
 from milx.networks.policy_network import Controller, ConvStack, PolicyOutput
 from milx.types import Params
+
+
+@dataclasses.dataclass
+class ContextConfig(NetworkConfig):
+    """The networks of a method without adaptation.
+
+    Attributes:
+        context: size of the vector that it keeps of a demonstration: units of the LSTM where there is one.
+    """
+
+    context: int = number(512, 1, LARGEST_SIZE)
+
+
+@dataclasses.dataclass
+class RecurrentConfig(ContextConfig):
+    """The networks of the LSTM baseline.
+
+    Attributes:
+        context_frames: time steps of a demonstration that the LSTM reads.
+    """
+
+    context_frames: int = number(10, 1, 10_000)
 
 
 class ContextNetwork(NamedTuple):
@@ -37,7 +60,7 @@ class ContextNetwork(NamedTuple):
 class LastFrame(nn.Module):
     """The context [D] of a demonstration's last image and state."""
 
-    config: NetworkConfig
+    config: ContextConfig
 
     @nn.compact
     def __call__(self, image: jax.Array | None, state: jax.Array, action: jax.Array) -> jax.Array:
@@ -55,7 +78,7 @@ class Recurrent(nn.Module):
     It reads `config.context_frames` of them, spread evenly from the first to the last.
     """
 
-    config: NetworkConfig
+    config: RecurrentConfig
 
     @nn.compact
     def __call__(self, image: jax.Array | None, state: jax.Array, action: jax.Array) -> jax.Array:

@@ -1,5 +1,6 @@
 """The policy network of the paper: convolutions, then fully connected layers that also see the robot's state."""
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import NamedTuple
@@ -8,11 +9,37 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from milx.config.schema import NetworkConfig
+from milx.config.schema import LARGEST_SIZE, NetworkConfig, number
 from milx.networks.goal import Goal, GoalHead, HindsightHead, StateGoalHead
 from milx.networks.layers import ConvBlock, Dense, FixedConv, SpatialSoftArgmax
 from milx.networks.learned_loss import LearnedLoss
 from milx.types import Params
+
+
+@dataclasses.dataclass
+class PolicyConfig(NetworkConfig):
+    """The network of MIL.
+
+    Attributes:
+        bias_transformation: size of the learned vector beside the first fully connected layer's input; 0 for none.
+        heads: 1, or 2 for a separate output layer in the inner loss.
+        inner_first_layer: a first fully connected layer of its own in the inner loss, as in the released code where
+            demonstrations are video alone.
+        target_head: predict where the episode ends with a linear layer from the first image's features, and show the
+            prediction to the layers after it, as the paper does (Section 6.3); its squared error joins all losses.
+        hindsight_head: where a demonstration is video alone, learn to tell from its first and last image what the goal
+            head is to see in the first, and let that be the goal in the inner step.
+        learned_loss: the inner loss where demonstrations show no actions (`MethodConfig.given`): "linear", or
+            "temporal" with convolutions over time (`milx.networks.learned_loss`); None where they show them.
+    """
+
+    bias_transformation: int = number(10, 0, LARGEST_SIZE)
+    heads: int = number(1, 1, 2)
+    inner_first_layer: bool = False
+    target_head: bool = False
+    hindsight_head: bool = False
+    learned_loss: str | None = None
+
 
 BIAS_TRANSFORMATION = "bias_transformation"
 """The parameter that joins the input of the first fully connected layer."""
@@ -82,14 +109,18 @@ class Controller(nn.Module):
     """From a feature map and the robot's state to an action.
 
     Attributes:
-        config: layers and heads.
+        config: layers and goal head.
         action_size: A.
         goal_size: G; 0 for no goal head whatever `config` says.
+        heads, inner_first_layer, target_head: as in `PolicyConfig`.
     """
 
     config: NetworkConfig
     action_size: int
     goal_size: int
+    heads: int = 1
+    inner_first_layer: bool = False
+    target_head: bool = False
 
     @nn.compact
     def __call__(
@@ -116,7 +147,7 @@ class Controller(nn.Module):
         if features is not None:
             seen = SpatialSoftArgmax()(features) if config.soft_argmax else features.reshape(len(features), -1)
             parts = [seen, *parts]
-            if config.target_head and self.goal_size:
+            if self.target_head and self.goal_size:
                 first = jnp.repeat(seen[::length], length, axis=0)
                 seen_target = Dense(self.goal_size, name="target_head")(first)
                 if target is not None:
@@ -129,9 +160,9 @@ class Controller(nn.Module):
         seen = jnp.concatenate(parts, axis=-1)
         hidden = functools.partial(Dense, hidden=True, norm=config.fc_norm, init_std=config.fc_init_std)
         layers = [hidden(size) for size in config.fc_layers]
-        heads = [Dense(self.action_size, init_std=config.fc_init_std) for _ in range(config.heads)]
+        heads = [Dense(self.action_size, init_std=config.fc_init_std) for _ in range(self.heads)]
         x = inner = _through(layers, seen)
-        if config.inner_first_layer:
+        if self.inner_first_layer:
             inner = _through([hidden(config.fc_layers[0], name="inner_first"), *layers[1:]], seen)
         return PolicyOutput(heads[-1](x), heads[0](inner), goal, features, inner, seen_target)
 
@@ -141,7 +172,7 @@ def _through(layers: list[Dense], x: jax.Array) -> jax.Array:
 
 
 class _Policy(nn.Module):
-    config: NetworkConfig
+    config: PolicyConfig
     action_size: int
     goal_size: int
 
@@ -151,15 +182,16 @@ class _Policy(nn.Module):
     ) -> PolicyOutput:
         # A learned constant joins the input of the first layer: its gradient gives the layer's bias a step of its own
         # (the paper's bias transformation, Section 4.1).
-        size = self.config.bias_transformation
+        config, size = self.config, self.config.bias_transformation
         z = self.param(BIAS_TRANSFORMATION, nn.initializers.zeros, (size,))
-        features = None if image is None else ConvStack(self.config, name="vision")(image, state.dtype)
-        controller = Controller(self.config, self.action_size, self.goal_size, name="controller")
+        features = None if image is None else ConvStack(config, name="vision")(image, state.dtype)
+        heads = config.heads, config.inner_first_layer, config.target_head
+        controller = Controller(config, self.action_size, self.goal_size, *heads, name="controller")
         return controller(features, state, jnp.broadcast_to(z, (len(state), size)), None, length, target)
 
 
 def make_policy(
-    config: NetworkConfig, image_shape: tuple[int, int] | None, state_size: int, action_size: int, goal_size: int
+    config: PolicyConfig, image_shape: tuple[int, int] | None, state_size: int, action_size: int, goal_size: int
 ) -> PolicyNetwork:
     """Builds the policy network.
 

@@ -9,7 +9,8 @@ import jax
 from absl import app, flags, logging
 from ml_collections import config_flags
 
-from milx.config import presets, schema
+from milx.config import assemble
+from milx.config.registry import PRESETS, load_plugins
 from milx.config.schema import Config
 from milx.core import parallel, platform
 from milx.envs import ENVS
@@ -59,7 +60,7 @@ def run(main: Callable[[Config, str], None]) -> None:
             raise app.UsageError(f"unexpected argument {argv[1]!r}")
         config = FLAGS.config
         if FLAGS.preset is None:
-            others = ", ".join(f"--preset={name}" for name in presets.PRESETS[config.env_name] if name != config.preset)
+            others = ", ".join(f"--preset={name}" for name in PRESETS[config.env_name] if name != config.preset)
             print(f"Running on {jax.default_backend()} with its default, --preset={config.preset}; also: {others}.")
         what = config.env_name if FLAGS.data is None else pathlib.Path(FLAGS.data).resolve().name
         name = f"{what}-{config.method_name}-{config.preset}-{config.seed}"
@@ -81,10 +82,11 @@ def parse(argv: Sequence[str], values: flags.FlagValues = FLAGS) -> list[str]:
     own = [arg for arg in argv if not arg.startswith(("--config", "-config"))]
     values(own)
     parallel.join_hosts(values.coordinator, values.num_processes, values.process_id)
+    load_plugins()
     preset = values.preset or ("cpu" if jax.default_backend() == "cpu" else "fast")
     try:
         if values.data is None:
-            config = presets.make_config(values.env, values.method, preset, values.seed)
+            config = assemble.make_config(values.env, values.method, preset, values.seed)
         else:
             config = recorded.make_config(values.data, values.method, preset, values.seed)
     except (ValueError, OSError) as error:
@@ -93,7 +95,7 @@ def parse(argv: Sequence[str], values: flags.FlagValues = FLAGS) -> list[str]:
     unset = [arg for arg in argv if arg.startswith("--config.") and arg.endswith("=None")]
     for arg in unset:  # ml_collections has no way to say None
         try:
-            schema.assign(config, arg.removeprefix("--config.").removesuffix("=None"), None)
+            assemble.assign(config, arg.removeprefix("--config.").removesuffix("=None"), None)
         except ValueError as error:
             raise flags.Error(str(error)) from error
     rest = [arg for arg in argv if arg not in unset]
@@ -103,10 +105,11 @@ def parse(argv: Sequence[str], values: flags.FlagValues = FLAGS) -> list[str]:
 
 def _check_fields(argv: Sequence[str], config: Config) -> None:
     """Raises flags.Error for --config.NAME where there is no such field; lists those that exist."""
-    known = schema.flatten(schema.to_dict(config))
+    known = assemble.fields(config)
     for arg in argv[1:]:
         name = arg.lstrip("-").split("=")[0]
         if name.startswith("config.") and (field := name.removeprefix("config.")) in _OWN_FLAGS:
             raise flags.Error(f"--{name}: expected --{_OWN_FLAGS[field]}, which also chooses the defaults")
         if name.startswith("config.") and name.removeprefix("config.") not in known:
-            raise flags.Error(f"--{name}: no such field, expected one of\n  " + "\n  ".join(known))
+            has = f"no such field with --method={config.method_name}, expected one of"
+            raise flags.Error(f"--{name}: {has}\n  " + "\n  ".join(known))

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 
-from milx.config import presets
+from milx.config import assemble
 from milx.config.check import check_config
 from milx.config.schema import GIVEN, Config
 from milx.data.dataset import DataSet, spread
@@ -37,7 +37,7 @@ def make_config(path: str | pathlib.Path, method: str = "mil", preset: str = "fa
     Raises:
         ValueError: for a path that holds no data set, or a preset that does not exist.
     """
-    config, head = presets.make_config(RECORDED, method, preset, seed), DataSet(path).header
+    config, head = assemble.make_config(RECORDED, method, preset, seed), DataSet(path).header
     config.recorded.path = str(pathlib.Path(path).resolve())
     if head.image_shape is None:
         config.network.filters = config.network.strides = ()
@@ -99,7 +99,7 @@ class RecordedRun(Run):
             raise ValueError(f"recorded.horizon: got {settings.horizon}, expected at least 1")
         if bad := [i for i in settings.goal_indices if not 0 <= i < self.data.header.state_size]:
             raise ValueError(f"recorded.goal_indices: got {bad[0]}, expected less than {self.data.header.state_size}")
-        self.given_action = config.mil.given == GIVEN[0]
+        self.given_action = config.method.given == GIVEN[0]
         for field, shots in (("train", train.shots), ("evaluation", config.evaluation.shots)):
             if shots >= MOST_DEMOS:
                 raise ValueError(f"{field}.shots: got {shots}, expected less than {MOST_DEMOS}")
@@ -137,7 +137,7 @@ class RecordedRun(Run):
     def _load(self) -> Training:
         with self._clock("demos"), self.console.status("reading demonstrations"):
             state, action = self._vectors
-            statistics = whitening.fit(jnp.asarray(state), jnp.asarray(action), self.config.mil.whiten_actions)
+            statistics = whitening.fit(jnp.asarray(state), jnp.asarray(action), self.config.method.whiten_actions)
             dataset_hash = self.data.fingerprint()
             held_out = [i for split in ("validation", "test") for i in self.data.header.of_split(split)]
             read_vectors(self.data, held_out, self.config.recorded.horizon)  # refuses what is not finite
@@ -167,7 +167,7 @@ class RecordedRun(Run):
             "num_tasks_train": len(training),
             "num_demos_train": sum(len(self.data.header.tasks[i].lengths) for i in training),
             "shots": self.config.evaluation.shots,
-            "given": self.config.mil.given,
+            "given": self.config.method.given,
             "score": 1 - errors["after"] / errors["mean_action"],
             "criterion": "squared error of the actions of held-out tasks' other demonstrations, in standard deviations",
             "action_error": errors,

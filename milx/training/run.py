@@ -25,7 +25,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from milx import methods
-from milx.config import schema
+from milx.config import assemble
 from milx.config.schema import Config
 from milx.core import parallel, platform
 from milx.core.checkpoint import UNVALIDATED, Checkpoints
@@ -165,8 +165,8 @@ class Run(abc.ABC):
             self.console.print(
                 f"step {int(state.step)}: validation {self.metric} {score:.1%}{listening.describe(heard)}"
             )
-            meta_updates = int(state.step) - config.imitation_steps
-            if 5 * meta_updates >= config.steps - config.imitation_steps and listening.is_deaf(heard):
+            meta_updates = int(state.step) - self.method.imitation_steps
+            if 5 * meta_updates >= config.steps - self.method.imitation_steps and listening.is_deaf(heard):
                 self._warn(listening.advice(has_inner_step=self.config.method_name == "mil"))
             with stop.deferred():
                 return save(state, score, checkpoints.replace)
@@ -273,10 +273,10 @@ class Run(abc.ABC):
         """Writes the configuration, or checks that the folder's is the same."""
         self.folder.mkdir(parents=True, exist_ok=True)
         path = self.folder / "config.json"
-        mine = schema.to_dict(self.config)
+        mine = assemble.to_dict(self.config)
         if path.is_file():
-            theirs = schema.to_dict(schema.read(path))
-            changed = schema.differences(theirs, mine)
+            theirs = assemble.to_dict(assemble.read(path))
+            changed = assemble.differences(theirs, mine)
             if changed:
                 raise ValueError(f"workdir: {self.folder} holds another run: {'; '.join(changed)}")
         else:

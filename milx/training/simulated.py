@@ -58,7 +58,7 @@ def training_on(env: envs.Env, config: Config, train: DemoSet) -> Training:
     most, shots = int(train.success.sum(axis=1).max()), config.train.shots
     if most <= shots:
         raise ValueError(f"data: at most {most} demonstrations of a task succeed, expected more than {shots}")
-    statistics = whitening.fit(_robot_states(env, train.states), train.action, config.mil.whiten_actions)
+    statistics = whitening.fit(_robot_states(env, train.states), train.action, config.method.whiten_actions)
 
     def first_images() -> np.ndarray:
         task, states = jax.tree.map(lambda x: x[:128], (train.task, train.states))

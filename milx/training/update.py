@@ -140,7 +140,7 @@ class Trainer:
 
     def _gradient(self, params: Params, batch: TaskBatch, step: jax.Array) -> tuple[Params, dict[str, jax.Array]]:
         """That of plain imitation for the first updates, if so configured, and of the meta-objective after them."""
-        first = self.train.imitation_steps
+        first = self.method.imitation_steps
 
         def meta_objective(params: Params, batch: TaskBatch) -> tuple[jax.Array, dict[str, jax.Array]]:
             return self.method.loss(params, batch, jnp.maximum(step - first, 0) / (self.train.steps - first))

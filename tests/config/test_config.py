@@ -1,14 +1,16 @@
 """Configurations: to JSON and back, presets, and what is said about names that do not exist."""
 
 import json
+import pathlib
 import re
 
 import pytest
 
+import milx
 from milx import methods
-from milx.config import schema
-from milx.config.presets import PRESETS, make_config, overrides
-from milx.config.schema import Config
+from milx.config import assemble, registry
+from milx.config.assemble import default_config, make_config, overrides
+from milx.config.registry import PRESETS
 from milx.types import Spec
 
 ALL = [(env, preset) for env, presets in PRESETS.items() for preset in presets]
@@ -20,10 +22,10 @@ def test_json_and_back(env, preset):
     config.train.support_frames = None
     config.network.filters = tuple(5 + i for i in range(len(config.network.strides)))
     config.optimizer.clip_norm = 0.125
-    again = schema.from_dict(json.loads(json.dumps(schema.to_dict(config))))
+    again = assemble.from_dict(json.loads(json.dumps(assemble.to_dict(config))))
     assert again == config
     assert isinstance(again.network.filters, tuple)
-    assert schema.differences(schema.to_dict(config), schema.to_dict(again)) == []
+    assert assemble.differences(assemble.to_dict(config), assemble.to_dict(again)) == []
 
 
 @pytest.mark.parametrize(("env", "preset"), ALL)
@@ -37,9 +39,9 @@ def test_presets_carry_their_names_and_share_nothing(env, preset):
 
 
 def test_fields_left_out_have_their_defaults():
-    config = schema.from_dict({"seed": 4, "train": {"steps": 7}})
-    expected = Config(seed=4)
-    expected.train.steps = 7
+    config = assemble.from_dict({"seed": 4, "train": {"steps": 7}})
+    expected = default_config("mil")
+    expected.seed, expected.train.steps = 4, 7
     assert config == expected
 
 
@@ -53,7 +55,7 @@ def test_fields_left_out_have_their_defaults():
 )
 def test_unknown_field_is_refused_and_the_valid_ones_listed(values, message, valid):
     with pytest.raises(ValueError, match="^" + re.escape(message)) as error:
-        schema.from_dict(values)
+        assemble.from_dict(values)
     listed = str(error.value).split("expected one of ")[1].split(", ")
     assert set(valid) <= set(listed)
     assert "nope" not in listed
@@ -62,7 +64,7 @@ def test_unknown_field_is_refused_and_the_valid_ones_listed(values, message, val
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"env": "nope"}, "env: got 'nope', expected one of reach, push, place, reach_state"),
+        ({"env": "nope"}, "env: got 'nope', expected one of reach, reach_state, push, place"),
         ({"env": "reach", "preset": "nope"}, "preset: got 'nope', expected one of paper, fast, cpu"),
     ],
 )
@@ -83,7 +85,7 @@ def test_differences_name_the_fields():
     old, new = make_config("reach", preset="cpu"), make_config("reach", preset="cpu", seed=2)
     old.train.meta_batch, new.train.meta_batch = 8, 9
     old.network.filters, new.network.filters = (24, 24), (1, 2)
-    found = schema.differences(schema.to_dict(old), schema.to_dict(new))
+    found = assemble.differences(assemble.to_dict(old), assemble.to_dict(new))
     assert found == [
         "seed was 0, now 2",
         "network.filters was (24, 24), now (1, 2)",
@@ -94,20 +96,20 @@ def test_differences_name_the_fields():
 def test_overrides_are_what_differs_from_the_preset():
     config = make_config("reach", preset="cpu", seed=3)
     assert overrides(config) == {}
-    config.network.filters, config.mil.inner_steps = (1, 2), 5
-    assert overrides(config) == {"network.filters": (1, 2), "mil.inner_steps": 5}
+    config.network.filters, config.method.inner_steps = (1, 2), 5
+    assert overrides(config) == {"network.filters": (1, 2), "method.inner_steps": 5}
 
 
 def test_fields_are_assigned_by_name_and_only_optional_ones_take_none():
     config = make_config("reach", preset="cpu")
     assert config.train.support_frames is not None
-    schema.assign(config, "train.support_frames", None)
-    schema.assign(config, "mil.inner_steps", 3)
-    assert overrides(config) == {"train.support_frames": None, "mil.inner_steps": 3}
+    assemble.assign(config, "train.support_frames", None)
+    assemble.assign(config, "method.inner_steps", 3)
+    assert overrides(config) == {"train.support_frames": None, "method.inner_steps": 3}
     with pytest.raises(ValueError, match=r"config\.train\.steps: got None, expected a value"):
-        schema.assign(config, "train.steps", None)
+        assemble.assign(config, "train.steps", None)
     with pytest.raises(ValueError, match=r"config\.train\.stepz: no such field"):
-        schema.assign(config, "train.stepz", 1)
+        assemble.assign(config, "train.stepz", 1)
 
 
 @pytest.mark.parametrize(("env", "preset"), [pair for pair in ALL if pair[1] != "paper"])
@@ -118,4 +120,46 @@ def test_methods_that_do_not_imitate_the_demonstration_see_what_they_see_at_test
 
 
 def test_flatten_joins_names_with_dots():
-    assert schema.flatten({"a": 1, "b": {"c": 2, "d": {"e": (3,)}}}) == {"a": 1, "b.c": 2, "b.d.e": (3,)}
+    assert assemble.flatten({"a": 1, "b": {"c": 2, "d": {"e": (3,)}}}) == {"a": 1, "b.c": 2, "b.d.e": (3,)}
+
+
+@pytest.mark.parametrize(("env", "preset"), ALL)
+def test_presets_name_fields_that_some_method_has(env, preset):
+    known = {name for method in methods.METHODS for name in assemble.fields(default_config(method))}
+    assert set(PRESETS[env][preset]) <= known
+
+
+def test_a_name_is_registered_once():
+    with pytest.raises(ValueError, match="method: 'lstm' is registered already, expected a name that is free"):
+        registry.register_method("lstm", make=None)
+
+
+RESULTS = pathlib.Path(__file__).parents[2] / "experiments" / "results"
+SHIPPED = pathlib.Path(milx.__file__).parent / "deploy" / "weights"
+
+
+def test_configurations_of_all_results_and_shipped_policies_load():
+    """Files of all layouts, from before methods had settings of their own on."""
+    files, versions = [*RESULTS.rglob("*.json"), *SHIPPED.rglob("result.json")], set()
+    configs = [content["config"] for content in map(_read, files) if isinstance(content, dict) and "config" in content]
+    for values in configs:
+        config, old = assemble.from_dict(values), assemble.flatten(values)
+        versions.add(values.get("config_version", 1))
+        for name, value in assemble.fields(config).items():
+            before = [group.replace("method.", "mil.") for group in (name, name.replace("method.imi", "train.imi"))]
+            found = [old[each] for each in (name, *before) if each in old]
+            assert not found or all(_as_json(value) == each for each in found), name
+    assert len(configs) > 200 and 1 in versions
+
+
+def _read(path):
+    return json.loads(path.read_text())
+
+
+def _as_json(value):
+    return json.loads(json.dumps(value))
+
+
+def test_a_later_layout_is_refused():
+    with pytest.raises(ValueError, match="config_version: got 99, expected at most 2: made by a later milx"):
+        assemble.from_dict({"config_version": 99})

@@ -11,7 +11,7 @@ import pytest
 
 import milx
 from milx import methods
-from milx.config.presets import make_config
+from milx.config.assemble import make_config
 from milx.deploy.policy import Policy
 from milx.export import export
 from milx.methods.whitening import Whitening

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 import milx
-from milx.config.presets import make_config
+from milx.config import assemble
+from milx.config.assemble import make_config
 from milx.core import pytrees
 from milx.deploy import pretrained
 from milx.deploy.policy import Policy
@@ -43,9 +44,7 @@ def test_what_is_saved_is_loaded(tmp_path, monkeypatch):
     like = milx.methods.params_like(method, spec)
     rng = np.random.default_rng(0)
     params = jax.tree.map(lambda x: rng.normal(size=x.shape).astype(x.dtype), like)
-    pretrained.save(
-        Policy(method, spec, params, config), {"config": milx.config.schema.to_dict(config)}, tmp_path / "mine"
-    )
+    pretrained.save(Policy(method, spec, params, config), {"config": assemble.to_dict(config)}, tmp_path / "mine")
     loaded = milx.load("mine")
     jax.tree.map(np.testing.assert_array_equal, loaded.params, params)
     assert loaded.config == config

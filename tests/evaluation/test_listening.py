@@ -8,10 +8,10 @@ import numpy as np
 import optax
 import pytest
 
-from milx.config.schema import MILConfig, TrainConfig
+from milx.config.schema import TrainConfig
 from milx.evaluation import listening
 from milx.methods import Method
-from milx.methods.mil import MIL
+from milx.methods.mil import MIL, MILConfig
 from milx.methods.whitening import Whitening
 from milx.networks.policy_network import PolicyNetwork, PolicyOutput
 from milx.training.update import Trainer, TrainState
@@ -112,8 +112,8 @@ def test_the_size_of_the_step_is_relative_to_the_tensor(batch):
 
 
 def test_a_run_imitates_first_and_measures_the_batch_that_comes_next(batch):
-    method, rate = MIL(MILConfig(inner_lr=0.1, inner_clip=1e9), CONSTANT), 0.05
-    train = TrainConfig(steps=10, imitation_steps=2, meta_batch=TASKS)
+    method, rate = MIL(MILConfig(inner_lr=0.1, inner_clip=1e9, imitation_steps=2), CONSTANT), 0.05
+    train = TrainConfig(steps=10, meta_batch=TASKS)
     rolled = lambda key: jax.random.randint(key, (), 0, 5)  # noqa: E731
 
     def sample(data, keys):
@@ -138,9 +138,10 @@ def test_a_run_imitates_first_and_measures_the_batch_that_comes_next(batch):
 
 def test_progress_counts_the_updates_with_an_inner_step(batch):
     """The multi-step loss has equal weights in the first of them, whenever that is."""
-    method = MIL(MILConfig(inner_lr=0.1, inner_clip=1e9, inner_steps=2, variant="multi_step"), CONSTANT)
+    config = MILConfig(inner_lr=0.1, inner_clip=1e9, inner_steps=2, variant="multi_step", imitation_steps=6)
+    method = MIL(config, CONSTANT)
     params = {"policy": {"a": jnp.asarray(THETA)}, "whitening": PLAIN}
-    trainer = Trainer(None, method, TrainConfig(steps=10, imitation_steps=6, meta_batch=TASKS), optax.sgd(0.1))
+    trainer = Trainer(None, method, TrainConfig(steps=10, meta_batch=TASKS), optax.sgd(0.1))
     for step, progress in ((6, 0.0), (8, 0.5)):
         _, metrics = jax.jit(trainer._gradient)(params, batch, jnp.asarray(step))
         expected = method.loss(params, batch, progress)[1]["loss"]

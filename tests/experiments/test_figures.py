@@ -19,7 +19,7 @@ import table3
 import tables
 
 from milx import envs, methods
-from milx.config.presets import make_config
+from milx.config.assemble import make_config
 from milx.training import state
 
 
@@ -108,7 +108,7 @@ def test_rows_of_the_published_method_fit_together_and_have_no_addition_unless_t
     config = published_rows.configure(row, row.shots[0], seed=0)
     methods.make(config, envs.make(row.env, (48, 48)).spec)
     state.check_steps(config)
-    additions = config.network.goal_head, config.train.redraw, config.mil.learn_inner_lr
+    additions = config.network.goal_head, config.train.redraw, getattr(config.method, "learn_inner_lr", False)
     assert not any(additions) or row in published_rows.TABLES["ladder"].values()
 
 

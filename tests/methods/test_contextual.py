@@ -10,7 +10,7 @@ import optax
 import pytest
 
 from milx import methods
-from milx.config.schema import Config, MILConfig, NetworkConfig
+from milx.config import assemble
 from milx.methods.whitening import Whitening
 from milx.types import Demo, Observation, Spec, TaskBatch
 
@@ -32,16 +32,16 @@ def build(name, vision, goal_head=False):
         image_to_goal=((0.5, 0.0), (0.0, -0.5), (0.1, 0.2)) if goal_head and vision else None,
         object_indices=() if vision else OBJECTS,
     )
-    network = NetworkConfig(
-        filters=(4,) * vision,
-        strides=(2,) * vision,
-        fc_layers=(16, 16),
-        bias_transformation=4,
-        context=8,
-        goal_head=goal_head,
-    )
-    config = Config(network=network, mil=MILConfig(inner_lr=0.1, learn_inner_lr=True, goal_weight=1.0))
-    method = methods.make(dataclasses.replace(config, method_name=name), spec)
+    config = assemble.default_config(name)
+    sizes = {"filters": (4,) * vision, "strides": (2,) * vision, "fc_layers": (16, 16), "goal_head": goal_head}
+    settings = {f"network.{field}": value for field, value in sizes.items()} | {"method.goal_weight": 1.0}
+    if name == "mil":
+        settings |= {"network.bias_transformation": 4, "method.inner_lr": 0.1, "method.learn_inner_lr": True}
+    else:
+        settings["network.context"] = 8
+    for field, value in settings.items():
+        assemble.assign(config, field, value)
+    method = methods.make(config, spec)
     zeros, ones = (fill((size,)) for fill, size in ((jnp.zeros, STATE), (jnp.ones, STATE)))
     whitening = Whitening(zeros, ones, jnp.zeros(ACTION), jnp.ones(ACTION))
     return method, jax.jit(method.init)(jax.random.key(0), whitening)
@@ -172,7 +172,7 @@ def test_the_context_tells_the_goal_head_what_to_look_for(name, vision):
 
 def test_attention_to_objects_that_nobody_tells_of_is_refused():
     spec = Spec(None, STATE, ACTION, ((-1.0,) * ACTION, (1.0,) * ACTION), goal_indices=(1,))
-    config = Config(method_name="lstm_attention", network=NetworkConfig(filters=(), strides=()))
+    config = assemble.default_config("lstm_attention")
     with pytest.raises(ValueError, match="method: got 'lstm_attention', expected another: the state does not tell"):
         methods.make(config, spec)
 
@@ -180,10 +180,10 @@ def test_attention_to_objects_that_nobody_tells_of_is_refused():
 @pytest.mark.parametrize(
     ("vision", "given", "learned", "message"),
     [
-        (True, "video+actions", None, r"mil\.given: got 'video\+actions', expected one of video\+state\+action"),
-        (False, "video", "linear", r"mil\.given: got 'video', expected the state, too: this policy sees no pixels"),
+        (True, "video+actions", None, r"method\.given: got 'video\+actions', expected one of video\+state\+action"),
+        (False, "video", "linear", r"method\.given: got 'video', expected the state, too: this policy sees no pixels"),
         (True, "video", "cubic", r"network\.learned_loss: got 'cubic', expected None or one of linear, temporal"),
-        (True, "video", None, r"network\.learned_loss: got None with mil\.given='video', expected one of linear, temp"),
+        (True, "video", None, r"network\.learned_loss: got None with method\.given='video', expected one of linear"),
         (
             True,
             "video+state+action",
@@ -195,22 +195,17 @@ def test_attention_to_objects_that_nobody_tells_of_is_refused():
 def test_demonstrations_that_show_too_little_are_refused(vision, given, learned, message):
     sizes = (STATE, ACTION, ((-1.0,) * ACTION, (1.0,) * ACTION))
     spec = Spec((32, 40) if vision else None, *sizes, goal_indices=(1,))
-    config = Config(network=NetworkConfig(learned_loss=learned))
-    config.mil.given = given
+    config = assemble.default_config("mil")
+    config.network.learned_loss, config.method.given = learned, given
     with pytest.raises(ValueError, match=message):
         methods.make(config, spec)
 
 
-@pytest.mark.parametrize(
-    ("name", "given", "goal_head"),
-    [("contextual", "video", True), ("mil", "video", False), ("mil", "video+state", True)],
-)
-def test_a_hindsight_head_without_use_is_refused(name, given, goal_head):
+@pytest.mark.parametrize(("given", "goal_head"), [("video", False), ("video+state", True)])
+def test_a_hindsight_head_without_use_is_refused(given, goal_head):
     spec = Spec((32, 40), STATE, ACTION, ((-1.0,) * ACTION, (1.0,) * ACTION), goal_indices=(1,))
-    network = NetworkConfig(learned_loss="linear", goal_head=goal_head, hindsight_head=True)
-    config = Config(method_name=name, network=network)
-    config.mil.given = given
-    with pytest.raises(
-        ValueError, match=r"network\.hindsight_head: got True, expected False: it is for MIL with a goal"
-    ):
+    config = assemble.default_config("mil")
+    config.network.learned_loss, config.network.goal_head, config.network.hindsight_head = "linear", goal_head, True
+    config.method.given = given
+    with pytest.raises(ValueError, match=r"network\.hindsight_head: got True, expected False: it is for a goal head"):
         methods.make(config, spec)

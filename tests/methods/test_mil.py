@@ -9,15 +9,13 @@ import numpy as np
 import optax
 import pytest
 
-from milx import methods
-from milx.config.schema import Config, MILConfig, NetworkConfig
 from milx.methods import mil
-from milx.methods.mil import MIL
+from milx.methods.mil import MIL, MILConfig
 from milx.methods.whitening import Whitening
 from milx.networks.goal import Goal
-from milx.networks.policy_network import PolicyNetwork, PolicyOutput, make_policy
+from milx.networks.policy_network import PolicyConfig, PolicyNetwork, PolicyOutput, make_policy
 from milx.training import update
-from milx.types import Demo, Observation, Spec, TaskBatch
+from milx.types import Demo, Observation, TaskBatch
 
 IMAGE_SHAPE, STATE, ACTION, TASKS, STEPS = (8, 10), 4, 2, 3, 5
 GOAL_INDICES = (1, 3)
@@ -59,7 +57,7 @@ def batch():
 @functools.cache
 def random_params(**network):
     """A tiny network and parameters that are nowhere zero."""
-    policy = make_policy(NetworkConfig(**TINY | network), IMAGE_SHAPE, STATE, ACTION, len(GOAL_INDICES))
+    policy = make_policy(PolicyConfig(**TINY | network), IMAGE_SHAPE, STATE, ACTION, len(GOAL_INDICES))
     rng = np.random.default_rng(1)
     draw = lambda leaf: jnp.asarray(leaf + 0.2 * rng.standard_normal(leaf.shape))  # noqa: E731
     return policy, jax.tree.map(draw, jax.jit(policy.init)(jax.random.key(0)))
@@ -485,9 +483,3 @@ def test_rematerialisation_keeps_the_meta_gradient_and_less_memory(batch):
         return sum(leaf.nbytes for leaf in jax.tree.leaves(jax.vjp(loss, params["policy"])[1]))
 
     assert kept(frugal) < 0.5 * kept(plain)
-
-
-def test_an_unknown_method_is_told_the_known_ones():
-    spec = Spec(IMAGE_SHAPE, STATE, ACTION, ((-1,) * ACTION, (1,) * ACTION), GOAL_INDICES)
-    with pytest.raises(ValueError, match="method: got 'maml', expected one of mil"):
-        methods.make(Config(method_name="maml"), spec)

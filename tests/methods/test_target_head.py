@@ -6,16 +6,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from milx.export import export
 
-from milx.config.schema import Config, EnvConfig, MILConfig, NetworkConfig
+from milx.config import assemble
 from milx.deploy import standalone
 from milx.deploy.policy import Policy
 from milx.evaluation import listening
 from milx.evaluation.rollout import replay
-from milx.methods.mil import MIL
+from milx.export import export
+from milx.methods.mil import MIL, MILConfig
 from milx.methods.whitening import Whitening
-from milx.networks.policy_network import make_policy
+from milx.networks.policy_network import PolicyConfig, make_policy
 from milx.types import Demo, Observation, Spec, TaskBatch
 
 IMAGE_SHAPE, STATE, ACTION, STEPS, INDICES = (8, 10), 4, 2, 5, (1, 3)
@@ -32,7 +32,7 @@ def float64():
 def case():
     """MIL with a target head, its parameters, and one demonstration with all axes."""
     rng = np.random.default_rng(0)
-    config = NetworkConfig(filters=(4,), strides=(2,), fc_layers=(8,), target_head=True)
+    config = PolicyConfig(filters=(4,), strides=(2,), fc_layers=(8,), target_head=True)
     network = make_policy(config, IMAGE_SHAPE, STATE, ACTION, len(INDICES))
     policy = jax.tree.map(lambda x: x + 0.3 * rng.standard_normal(x.shape), network.init(jax.random.key(0)))
     demo = Demo(
@@ -83,7 +83,7 @@ def test_listening_remembers_the_first_image(case):
 def test_policies_with_a_memory_act_step_by_step(case, tmp_path):
     """The policy, and its export, act as in the loop; without their memory they do not act at all."""
     method, _, demo = case
-    config = Config(env=EnvConfig(image_shape=IMAGE_SHAPE))
+    config = assemble.default_config("mil")
     config.recorded.path, config.recorded.horizon = "a data set", STEPS
     spec = Spec(IMAGE_SHAPE, STATE, ACTION, None, INDICES)
     with jax.enable_x64(False):

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from milx import methods
-from milx.config.schema import VARIANTS, Config, MILConfig, NetworkConfig
+from milx.config import assemble
 from milx.core.pytrees import leaves
-from milx.methods.mil import MIL
+from milx.methods.mil import MIL, VARIANTS, MILConfig
 from milx.methods.whitening import Whitening
-from milx.networks.policy_network import PolicyNetwork, PolicyOutput, make_policy
+from milx.networks.policy_network import PolicyConfig, PolicyNetwork, PolicyOutput, make_policy
 from milx.types import Demo, Spec, TaskBatch
 
 STATE, ACTION, TASKS, STEPS = 4, 2, 3, 5
@@ -59,7 +59,7 @@ def constant(**config):
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_the_inner_step_changes_what_the_variant_says_and_nothing_else(batch, variant):
     network = make_policy(
-        NetworkConfig(filters=(), strides=(), fc_layers=(8, 8), heads=2, bias_transformation=3), None, STATE, ACTION, 0
+        PolicyConfig(filters=(), strides=(), fc_layers=(8, 8), heads=2, bias_transformation=3), None, STATE, ACTION, 0
     )
     policy = jax.tree.map(
         lambda x: x + 0.2 * np.random.default_rng(1).standard_normal(x.shape), network.init(jax.random.key(0))
@@ -107,19 +107,19 @@ def test_imitation_takes_no_inner_step_and_sees_support_and_query(batch):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"mil.variant": "reptile"}, "mil.variant: got 'reptile', expected one of maml, anil"),
-        ({"mil.variant": "cavia", "network.bias_transformation": 0}, "network.bias_transformation: got 0"),
-        ({"mil.variant": "anil", "network.heads": 2}, "network.heads: got 2 with network.learned_loss=None"),
-        ({"train.imitation_steps": 30_000}, "train.imitation_steps: got 30000, expected less than train.steps = 30000"),
-        ({"mil.variant": "multi_step"}, "mil.inner_steps: got 1, expected at least 2"),
-        ({"network.target_head": True, "method_name": "lstm"}, "network.target_head: got True with method 'lstm'"),
-        ({"train.imitation_steps": 5, "method_name": "lstm"}, "train.imitation_steps: got 5 with method 'lstm'"),
+        ({"method.variant": "reptile"}, "method.variant: got 'reptile', expected one of maml, anil"),
+        ({"method.variant": "cavia", "network.bias_transformation": 0}, "network.bias_transformation: got 0"),
+        ({"method.variant": "anil", "network.heads": 2}, "network.heads: got 2 with network.learned_loss=None"),
+        (
+            {"method.imitation_steps": 30_000},
+            "method.imitation_steps: got 30000, expected less than train.steps = 30000",
+        ),
+        ({"method.variant": "multi_step"}, "method.inner_steps: got 1, expected at least 2"),
     ],
 )
 def test_a_variant_that_cannot_be_is_refused(changes, message):
-    config = Config(network=NetworkConfig(filters=(), strides=()))
+    config = assemble.default_config("mil")
     for name, value in changes.items():
-        holder = config if "." not in name else getattr(config, name.split(".")[0])
-        setattr(holder, name.split(".")[-1], value)
+        assemble.assign(config, name, value)
     with pytest.raises(ValueError, match=message):
         methods.make(config, Spec(None, STATE, ACTION, None, ()))

@@ -5,12 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from milx.config.schema import NetworkConfig
 from milx.networks.attention import AttentiveActor, ObjectTokens, split_objects
+from milx.networks.encoders import ContextConfig
 
 STATE, ACTION, STEPS, BATCH = 7, 2, 5, 4
 OBJECTS = ((1, 2), (5, 6), (3, 4))
-CONFIG = NetworkConfig(filters=(), strides=(), fc_layers=(16,), context=8)
+CONFIG = ContextConfig(filters=(), strides=(), fc_layers=(16,), context=8)
 
 
 @pytest.fixture(scope="module")

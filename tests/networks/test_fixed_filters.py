@@ -9,14 +9,13 @@ import pytest
 import scipy.signal
 from safetensors.numpy import save_file
 
-from milx.config.schema import MILConfig, NetworkConfig
-from milx.methods.mil import MIL
+from milx.methods.mil import MIL, MILConfig
 from milx.methods.whitening import Whitening
 from milx.networks import fixed_filters
-from milx.networks.policy_network import make_policy
+from milx.networks.policy_network import PolicyConfig, make_policy
 from milx.types import Demo, TaskBatch
 
-CONFIG = NetworkConfig(filters=(6, 4), strides=(2, 1), fixed_filters="kmeans", soft_argmax=True, fc_layers=(8,))
+CONFIG = PolicyConfig(filters=(6, 4), strides=(2, 1), fixed_filters="kmeans", soft_argmax=True, fc_layers=(8,))
 RNG = np.random.default_rng(0)
 WEIGHT, BIAS = RNG.normal(size=(6, 3, 3, 3)).astype(np.float32), RNG.normal(size=6).astype(np.float32)
 

@@ -5,8 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from milx.config.schema import NetworkConfig
-from milx.networks.policy_network import make_policy
+from milx.networks.policy_network import PolicyConfig, make_policy
 
 IMAGE_SHAPE, STATE, ACTION, GOAL, BATCH = (8, 10), 3, 2, 2, 6
 TINY = {"filters": (4, 4), "strides": (2, 2), "fc_layers": (8,), "bias_transformation": 5}
@@ -21,7 +20,7 @@ def inputs():
 
 def build(**changes):
     """A tiny network, and parameters that are nowhere zero."""
-    network = make_policy(NetworkConfig(**TINY | changes), IMAGE_SHAPE, STATE, ACTION, GOAL)
+    network = make_policy(PolicyConfig(**TINY | changes), IMAGE_SHAPE, STATE, ACTION, GOAL)
     leaves, tree = jax.tree.flatten(jax.jit(network.init)(jax.random.key(0)))
     rng = np.random.default_rng(1)
     network = network._replace(apply=jax.jit(network.apply))

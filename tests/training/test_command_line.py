@@ -19,7 +19,8 @@ def train(folder, *arguments):
     [
         ("--env=nope", "env: got 'nope'", ["reach"]),
         ("--preset=nope", "preset: got 'nope'", ["paper", "fast", "cpu"]),
-        ("--config.train.nope=1", "--config.train.nope: no such field", ["train.steps", "mil.inner_lr", "seed"]),
+        ("--config.network.context=7", "--config.network.context: no such field with --method=mil", ["network.heads"]),
+        ("--config.train.nope=1", "--config.train.nope: no such field", ["train.steps", "method.inner_lr", "seed"]),
     ],
 )
 def test_bad_input_ends_with_a_message_that_lists_what_is_valid(tmp_path, argument, message, valid):
@@ -31,6 +32,32 @@ def test_bad_input_ends_with_a_message_that_lists_what_is_valid(tmp_path, argume
     listed = re.split(r"[,\s]+", said.split("expected one of")[1])
     assert set(valid) <= set(listed)
     assert list(tmp_path.iterdir()) == [], "no run was begun"
+
+
+def test_a_method_has_no_settings_of_another(tmp_path):
+    said = train(tmp_path, "--method=lstm", "--config.method.inner_steps=7").stderr
+    assert "--config.method.inner_steps: no such field with --method=lstm, expected one of" in said
+    assert "method.given" in said and "network.context_frames" in said and "network.heads" not in said
+
+
+def test_a_package_of_ones_own_is_found(tmp_path, monkeypatch):
+    """An installed distribution that names its module as a plugin: its environment and its method have flags."""
+    (tmp_path / "mine.py").write_text(
+        "import milx\n"
+        "from milx.envs.reach.env import ReachState\n"
+        "from milx.envs.reach.presets import REACH_STATE\n"
+        "class Mine(ReachState):\n"
+        "    name = 'my_env'\n"
+        "milx.register_env(Mine, REACH_STATE)\n"
+        "milx.register_method('my_method', make=None)\n"
+    )
+    info = tmp_path / "mine-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: mine\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[milx.plugins]\nmine = mine\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    said = train(tmp_path, "--env=my_env", "--method=my_method", "--config.train.nope=1").stderr
+    assert "--config.train.nope: no such field with --method=my_method" in said
 
 
 def test_value_of_another_type_ends_with_a_message(tmp_path):

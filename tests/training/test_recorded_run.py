@@ -259,7 +259,7 @@ def test_what_may_be_shown_without_actions_is_not_what_is_asked_for(tmp_path):
                 demos = [demo if i == place else dataclasses.replace(demo, action=None) for i, demo in enumerate(demos)]
                 writer.add(split, split, [HORIZON] * 3, demos)
         config = tiny_config(folder)
-        config.mil.given, config.network.learned_loss = "video+state", "linear"
+        config.method.given, config.network.learned_loss = "video+state", "linear"
         queries, support = make_run(config, tmp_path / f"run {place}", QUIET)._task(1, 2)
         assert queries.acts.tolist() == [True] + [False] * (len(queries.acts) - 1)
         np.testing.assert_array_equal(queries.demo.action[0], DataSet(folder).read(1, place).action)

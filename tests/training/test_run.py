@@ -12,7 +12,7 @@ from tiny import QUIET, tiny_config
 
 import milx
 from milx import methods
-from milx.config import schema
+from milx.config import assemble
 from milx.core import pytrees
 from milx.core.checkpoint import Checkpoints
 from milx.methods import params_like
@@ -189,7 +189,7 @@ def test_evaluation_is_a_result_file(trained):
     low, high = result["wilson95"]
     assert 0 <= low <= result["success"] <= high <= 1
     assert high - low > 0.3, "six trials tell little"
-    assert schema.from_dict(result["config"]) == trained.config
+    assert assemble.from_dict(result["config"]) == trained.config
     assert result["dataset_hash"] == pytrees.fingerprint(trained.train)
     assert set(result["baselines"]) == {"random", "task_blind", "expert", "other_demo"}
     for rate in (result["success"], *result["baselines"].values()):

@@ -5,7 +5,8 @@ import numpy as np
 import optax
 import pytest
 
-from milx.config.presets import PRESETS
+from milx.config.assemble import make_config
+from milx.config.registry import PRESETS
 from milx.config.schema import OptimizerConfig
 from milx.training.update import make_optimizer
 
@@ -34,7 +35,7 @@ def test_schedule(warmup, cosine):
 
 @pytest.mark.parametrize("preset", PRESETS["reach"])
 def test_every_preset_learns(preset):
-    config = PRESETS["reach"][preset]().optimizer
+    config = make_config("reach", preset=preset).optimizer
     assert rates(config).max() == pytest.approx(config.learning_rate, rel=1e-3)
 
 

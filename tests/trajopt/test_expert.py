@@ -8,7 +8,7 @@ import planned
 import pytest
 
 import milx
-from milx.envs.reach import Reach
+from milx.envs.reach.env import Reach
 from milx.trajopt import expert
 from milx.trajopt.ilqr import Options
 

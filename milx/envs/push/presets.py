@@ -1,0 +1,93 @@
+"""Presets of push, and of recorded demonstrations, which begin with those of push."""
+
+from milx.config.presets import CONDITIONED, GOAL_HEAD
+from milx.config.registry import Overrides
+
+_WORLD: Overrides = {
+    "env.image_shape": (125, 125),
+    "data.tasks": 769,
+    "data.demos_per_task": 12,
+    "data.noise": 0.1,
+    "data.spare_demos": 2,
+    "data.plan_iterations": 0,
+    "evaluation.tasks": 740,
+    "evaluation.trials": 6,
+    "evaluation.baseline_trials": 6,
+    "evaluation.batch": 185,
+}
+_PAPER = (
+    CONDITIONED
+    | _WORLD
+    | {
+        "network.filters": (16, 16, 16, 16),
+        "network.strides": (2, 2, 2, 2),
+        "network.kernel": 5,
+        "network.soft_argmax": True,
+        "network.fc_layers": (200, 200, 200),
+        "network.fc_norm": False,
+        "network.bias_transformation": 20,
+        "network.heads": 2,
+        "network.mixed_precision": True,
+        "method.inner_lr": 0.03,
+        "method.inner_clip": 10.0,
+        "method.whiten_actions": True,
+        "method.imitation_steps": 2000,
+        "train.steps": 20_000,
+        "train.meta_batch": 15,
+    }
+)
+_FAST = (
+    CONDITIONED
+    | GOAL_HEAD
+    | _WORLD
+    | {
+        "network.filters": (32, 32, 32, 32),
+        "network.strides": (2, 2, 2, 1),
+        "network.kernel": 5,
+        "network.mixed_precision": True,
+        "network.soft_argmax": True,
+        "network.fc_layers": (200, 200, 200),
+        "network.bias_transformation": 20,
+        "optimizer.learning_rate": 3e-3,
+        "train.meta_batch": 32,
+        "train.support_frames": 4,
+        "train.query_frames": 8,
+        "train.redraw": True,
+    }
+)
+_CPU = _FAST | {
+    "env.image_shape": (48, 48),
+    "data.tasks": 200,
+    "data.demos_per_task": 6,
+    "network.filters": (16, 16, 16, 16),
+    "network.kernel": 3,
+    "network.strides": (2, 2, 1, 1),
+    "network.mixed_precision": False,
+    "train.steps": 10_000,
+    "train.meta_batch": 8,
+    "train.log_every": 25,
+    "train.eval_every": 2500,
+    "evaluation.validation_tasks": 25,
+    "evaluation.tasks": 74,
+    "evaluation.baseline_trials": 1,
+    "evaluation.batch": 25,
+}
+
+PUSH: dict[str, Overrides] = {"paper": _PAPER, "fast": _FAST, "cpu": _CPU}
+
+_RECORDED_FAST = _FAST | {"train.steps": 10_000, "train.eval_every": 1000, "train.redraw": False}
+RECORDED: dict[str, Overrides] = {
+    "fast": _RECORDED_FAST,
+    "cpu": _RECORDED_FAST
+    | {
+        "network.filters": (16, 16, 16, 16),
+        "network.kernel": 3,
+        "network.strides": (2, 2, 2, 1),
+        "network.fc_layers": (100, 100, 100),
+        "network.mixed_precision": False,
+        "train.steps": 2000,
+        "train.meta_batch": 4,
+        "train.log_every": 50,
+        "train.eval_every": 500,
+    },
+}

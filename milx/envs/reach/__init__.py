@@ -1,0 +1,1 @@
+"""A planar arm that touches one of three cubes."""
