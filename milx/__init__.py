@@ -4,7 +4,6 @@ Importing it changes nothing in the process; launchers call `configure` first, a
 """
 
 import importlib
-import importlib.metadata
 from types import ModuleType
 
 from milx.config.registry import register_env, register_method
@@ -15,7 +14,7 @@ from milx.envs import ENVS, make
 from milx.methods import METHODS
 from milx.types import Demo, Observation
 
-__version__ = importlib.metadata.version("milx")
+__version__ = "0.1.0"
 __all__ = [
     "ENVS",
     "METHODS",

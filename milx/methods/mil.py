@@ -2,12 +2,15 @@
 
 For a task with demonstrations d (support) and d' (query) of the same goal in different scenes,
 
-    theta' = theta - alpha * clip(grad_theta L(theta, d))        the inner step, eq. 1
-    minimise over theta:  sum over tasks of L(theta', d')        the meta-objective, eq. 3
+    theta' = theta - alpha clip(grad_theta L(theta, d))          the inner step (Section 3.2)
+    minimise over theta the mean over tasks of L(theta', d')     the meta-objective (eq. 1, a sum there)
 
-with the behavioural cloning loss L(theta, d) = mean over t of |m (a_t - pi_theta(o_t))|^2, eq. 2. Where d shows no
-actions the inner step descends a learned loss instead, whose parameters are part of theta. `jax.grad` goes through the
-inner step, `vmap` over the tasks.
+with the behavioural cloning loss of K demonstrations of T time steps and actions in R^A,
+
+    L(theta, d) = 1 / (K T A) sum over k, t, i of (m (a_kti - pi_theta(o_kt)_i))^2,
+
+which is eq. 2 but for the factor m^2 / (K T A). Where d shows no actions the inner step descends a learned loss instead
+(Section 4.3), whose parameters are part of theta. `jax.grad` goes through the inner step, `vmap` over the tasks.
 """
 
 import dataclasses
@@ -125,7 +128,7 @@ class MIL(Method):
         return params
 
     def adapt(self, params: Params, demo: Demo) -> Params:
-        """Takes the inner gradient steps (eq. 1) on demonstrations [K, T, ...]: their gradients are averaged."""
+        """Takes the inner gradient steps on demonstrations [K, T, ...]: their gradients are averaged."""
         return {"policy": self._steps(params, demo)[-1], "whitening": params["whitening"]}
 
     def _steps(self, params: Params, demo: Demo) -> list[Params]:
@@ -167,7 +170,7 @@ class MIL(Method):
     def loss(
         self, params: Params, batch: TaskBatch, progress: jax.Array | float = 1.0
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """The meta-objective (eq. 3), averaged over the tasks; and its parts, [N] of each task.
+        """The meta-objective, averaged over the tasks; and its parts, [N] of each task.
 
         With the variant "multi_step" it is sum over i = 1..n of w_i L(theta_i, d'), theta_i being the parameters after
         i of the n inner steps: w_i = (1 - progress) / n for i < n, and w_n is what they leave of 1 (Antoniou et al.

@@ -1,10 +1,15 @@
 """Where the demonstration went, read off the image: a mixture density over the positions of a feature map.
 
-Every position of the map votes for one goal, the same for all images: an affine function of where the position lies.
-A learned filter weighs the votes. The paper (Section 6.3) predicts such a point with a linear layer and the squared
-error, whose best blind guess is the mean of all candidates, which no candidate looks like. The best blind mixture finds
-the candidates; and the gradient of its likelihood in the filter is the feature where the demonstration went minus the
-mean feature of the candidates. So one inner step turns the filter towards what was shown.
+With features f_p in R^C at the P positions p of the map, a learned filter w in R^C and a learned log sigma,
+
+    p(g | image) = sum over p of softmax(w . f)_p N(g; v_p, sigma^2 I),        v_p = V^T (x_p, y_p, 1),
+
+so every position votes for one goal v_p in R^G, the same for all images: an affine function of where the position lies,
+with V in R^(3 x G), x_p and y_p in [-1, 1] across and down the image. The filter weighs the votes. The paper
+(Section 6.3) predicts such a point with a linear layer and the squared error, whose best blind guess is the mean of all
+candidates, which no candidate looks like. The best blind mixture finds the candidates; and the gradient of its
+likelihood in the filter is the feature where the demonstration went minus the mean feature of the candidates. So one
+inner step turns the filter towards what was shown.
 
 All this waits until the votes are about right: from zero, one seed found them within 1,000 updates, another not within
 2,000. So they start from the camera's calibration where it is known (`calibrate`), and are learned from there on.

@@ -14,9 +14,10 @@ class LearnedLoss(nn.Module):
     """Maps what the policy makes of demonstrations, [K, T, F], to a loss [K].
 
     Attributes:
-        kind: "linear" is the mean over time of |W y + b|^2 (Finn, Yu et al. 2017). "temporal" puts two convolutions
-            over time with layer norm and ReLU before it (Yu et al. 2018, arXiv:1802.01557), so that the order of the
-            time steps matters: adapt to as many of them as in training.
+        kind: "linear" is 1 / (T D) sum over t, i of (W y_t + b)_i^2, with D = 32 rows in W (Finn, Yu et al. 2017,
+            Section 4.3, where it is the sum). "temporal" puts two convolutions over time with layer norm and ReLU
+            before it (Yu et al. 2018, arXiv:1802.01557), so that the order of the time steps matters: adapt to as many
+            of them as in training.
     """
 
     kind: str
