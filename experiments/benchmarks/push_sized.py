@@ -12,9 +12,10 @@ import jax.numpy as jnp
 import mujoco
 from mujoco import mjx
 
-from milx.config.schema import Config, DataConfig, EnvConfig, NetworkConfig, TrainConfig
+from milx.config.schema import Config, DataConfig, EnvConfig, TrainConfig
 from milx.envs.base import Env, State
 from milx.methods.mil import MILConfig
+from milx.networks.policy_network import PolicyConfig
 
 _JOINTS = ("0 0 1", "0 1 0", "0 0 1", "0 1 0", "1 0 0", "0 1 0", "1 0 0")
 _THING = """
@@ -151,9 +152,11 @@ def config(**train: Any) -> Config:
     """The paper's network and hyperparameters for push: four 5x5 convolutions of 16 filters, 15 tasks, two heads."""
     return Config(
         env_name="push_sized",
+        method_name="mil",
+        preset="paper",
         env=EnvConfig(image_shape=PushSized.image_shape),
         data=DataConfig(tasks=64, demos_per_task=4),
-        network=NetworkConfig(
+        network=PolicyConfig(
             filters=(16,) * 4,
             strides=(2,) * 4,
             kernel=5,
@@ -162,6 +165,6 @@ def config(**train: Any) -> Config:
             bias_transformation=20,
             heads=2,
         ),
-        mil=MILConfig(inner_lr=0.01, inner_clip=10.0, loss_scale=50.0),
+        method=MILConfig(inner_lr=0.01, inner_clip=10.0, loss_scale=50.0),
         train=TrainConfig(**{"meta_batch": 15, **train}),
     )

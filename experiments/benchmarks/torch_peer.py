@@ -51,7 +51,7 @@ def make_step(config: Config, mode: str, bf16: bool) -> Callable[..., dict[str, 
         mode: "loop" over tasks with autograd, "vmap" with torch.func, or "compile", the same through torch.compile.
         bf16: convolve in bfloat16.
     """
-    net, mil = config.network, config.mil
+    net, mil = config.network, config.method
     depth = len(net.fc_layers)
     dtype = torch.bfloat16 if bf16 else torch.float32
 

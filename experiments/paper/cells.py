@@ -27,11 +27,11 @@ from milx.core.checkpoint import Checkpoints
 from milx.data import simulated as demos_lib
 from milx.data.simulated import DemoSet
 from milx.evaluation import closed_loop, listening, provenance, results
-from milx.training import signals
+from milx.training import loop, signals
 from milx.training.metrics import MetricsWriter, read_metrics
 from milx.training.simulated import result_of, split_demos, training_on, trial_key, validation_of
 from milx.training.state import Training, check_steps, initial_state, restore_state, save_state
-from milx.training.update import Trainer, make_optimizer
+from milx.training.update import Trainer, TrainState, make_optimizer
 from milx.types import Params
 
 METHODS = {
@@ -211,49 +211,45 @@ class Cells:
         return self.folder / "unfinished" / hashlib.sha256(contents.encode()).hexdigest()[:16]
 
     def _fit(self, name: str, config: Config, training: Training, checkpoints: Checkpoints) -> Trained:
-        env, trainer, every = self._env(config), self._trainer(config), config.train.log_every
+        env, trainer = self._env(config), self._trainer(config)
         evaluation = dataclasses.replace(config.evaluation, shots=config.train.shots)
         validation = self._demos(dataclasses.replace(config, evaluation=evaluation), "validation")
-        data = training.at(0)
         state, key = initial_state(trainer, config, training)
-        seconds, began = dict.fromkeys(("compile", "train", "evaluate"), 0.0), time.perf_counter()
+        clock, stop, losses = loop.Clock(), signals.Stop(), dict[str, float]()
         if checkpoints.latest is not None:
-            state, seconds = restore_state(checkpoints, checkpoints.latest, state, training.dataset_hash)
+            state, clock.seconds = restore_state(checkpoints, checkpoints.latest, state, training.dataset_hash)
             print(f"  {name}: goes on from step {int(state.step)}", flush=True)
 
-        def lap(name: str) -> None:
-            nonlocal began
-            now = time.perf_counter()
-            seconds[name] += now - began
-            began = now
+        def compile_scan() -> Any:
+            lowered = Trainer.run.lower(trainer, state, training.at(0), key, config.train.log_every)
+            return lowered.compile(platform.pixel_options(env.chain))
 
-        options = platform.pixel_options(env.chain)
-        compiled = self._once(
-            ("compiled", self._programs(config)),
-            lambda: Trainer.run.lower(trainer, state, data, key, every).compile(options),
+        with clock("compile"):
+            scan = self._once(("compiled", self._programs(config)), compile_scan)
+
+        def validate(state: TrainState) -> float:
+            step = int(state.step)
+            success, heard = validation_of(env, trainer.method, state.params, validation, evaluation)
+            metrics.write(step, losses | {"validation_success": success, **heard})
+            said = "".join(f"loss {loss:.3f}, " for loss in losses.values())
+            print(f"  {name} {step}: {said}validation {success:.1%}{listening.describe(heard)}", flush=True)
+            return success
+
+        hooks = loop.Hooks(
+            log=lambda _, values: losses.update(loss=values["loss"]),
+            validate=validate,
+            save=lambda write, state, score: save_state(write, state, score, clock.elapsed(), training.dataset_hash),
         )
-        lap("compile")
-        step, written = int(state.step), True
-        log = MetricsWriter(checkpoints.folder.parent, step, print)
-        while step < config.train.steps:
-            state, metrics = compiled(state, data, key)
-            step += every
-            if step % config.train.eval_every == 0 or step == config.train.steps:
-                loss = float(metrics["loss"])
-                lap("train")
-                success, heard = validation_of(env, trainer.method, state.params, validation, evaluation)
-                log.write(step, {"loss": loss, "validation_success": success, **heard})
-                lap("evaluate")
-                said = listening.describe(heard)
-                print(f"  {name} {step}: loss {loss:.3f}, validation {success:.1%}{said}", flush=True)
-                written = save_state(checkpoints.save, state, success, seconds, training.dataset_hash)
-                lap("evaluate")
-        log.close()
+        metrics = MetricsWriter(checkpoints.folder.parent, int(state.step), print)
+        with contextlib.closing(metrics), stop.listen():
+            state = loop.fit(scan, state, key, training, config.train, checkpoints, hooks, clock, stop)
+        if int(state.step) < config.train.steps:
+            raise SystemExit(0)
         best = checkpoints.best
-        if best is None or not written:
-            raise ValueError(f"{checkpoints.folder}: the checkpoint of step {step} could not be written")
+        assert best is not None
         params = checkpoints.restore(best, {"params": state.params})[0]["params"]
         curve = read_metrics(checkpoints.folder.parent / "metrics.jsonl")
+        seconds = {name: clock.seconds[name] for name in ("compile", "train", "evaluate")}
         return Trained(params, best, checkpoints.score(best), seconds, curve)
 
     def _trainer(self, config: Config) -> Trainer:

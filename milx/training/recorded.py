@@ -135,7 +135,7 @@ class RecordedRun(Run):
         return read_vectors(self.data, self.shards.tasks, self.config.recorded.horizon)
 
     def _load(self) -> Training:
-        with self._clock("demos"), self.console.status("reading demonstrations"):
+        with self.clock("demos"), self.console.status("reading demonstrations"):
             state, action = self._vectors
             statistics = whitening.fit(jnp.asarray(state), jnp.asarray(action), self.config.method.whiten_actions)
             dataset_hash = self.data.fingerprint()
@@ -160,7 +160,7 @@ class RecordedRun(Run):
         return 1 - heard["own_demo"], heard
 
     def _judge(self, params: Params) -> tuple[dict[str, Any], Callable[[dict[str, Any]], None]]:
-        with self._clock("evaluate"):
+        with self.clock("evaluate"):
             errors = self._errors(params, "test")
         training = self.shards.tasks
         found = {

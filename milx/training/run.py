@@ -11,9 +11,9 @@ learning_curve.png
 
 import abc
 import contextlib
+import functools
 import pathlib
 import tempfile
-import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
@@ -32,14 +32,11 @@ from milx.core.checkpoint import UNVALIDATED, Checkpoints
 from milx.evaluation import listening, results
 from milx.methods import params_like
 from milx.networks import fixed_filters
-from milx.training import signals
+from milx.training import loop, signals
 from milx.training.metrics import MetricsWriter
 from milx.training.state import Training, check_steps, initial_state, restore_state, save_state
 from milx.training.update import Sample, Trainer, TrainState, make_optimizer
 from milx.types import Params, Spec
-
-MOST_IN_VAIN = 100
-"""Updates in a row that are not finite, after which a run stops (at the end of the scan)."""
 
 
 def _describe_skipped(values: dict[str, float], step: int) -> str:
@@ -88,8 +85,7 @@ class Run(abc.ABC):
             raise ValueError(f"train.meta_batch: got {config.train.meta_batch}, expected {expected}")
         self.method = methods.make(config, spec)
         self.trainer = Trainer(sample, self.method, config.train, make_optimizer(config.optimizer, config.train.steps))
-        self.seconds = {"demos": 0.0, "compile": 0.0, "train": 0.0, "evaluate": 0.0, "total": 0.0}
-        self._began = time.perf_counter()
+        self.clock = loop.Clock()
         self._claim_folder()
 
     @abc.abstractmethod
@@ -125,7 +121,7 @@ class Run(abc.ABC):
 
         Raises:
             ValueError: if another process trains in this folder, its checkpoints are all damaged, the last one could
-                not be written, or MOST_IN_VAIN updates in a row were skipped because they were not finite.
+                not be written, or `loop.MOST_IN_VAIN` updates in a row were skipped because they were not finite.
             SystemExit: with code 0, after SIGTERM.
         """
         stop = signals.Stop()
@@ -138,83 +134,48 @@ class Run(abc.ABC):
 
     def _train(self, stop: signals.Stop) -> None:
         config = self.config.train
-        checkpoints = Checkpoints(self._checkpoints, report=self._warn)
-        latest = checkpoints.latest
-        if latest is not None and latest >= config.steps and checkpoints.score(latest) != UNVALIDATED:
-            return checkpoints.close()
-        if self.config.network.fixed_filters not in (None, fixed_filters.KMEANS):
-            fixed_filters.load(
-                self.config.network.fixed_filters, self.config.network
-            )  # refuses a bad file before planning
-        compiled = self._compile_in_background()
-        training = self._load()
-        state, key = self._start(training, checkpoints)
-        with self._clock("compile"):
-            run_steps = compiled.result()
-        metrics, written, step = MetricsWriter(self.folder, int(state.step), self._warn), True, int(state.step)
-
-        def save(state: TrainState, score: float, write: Callable[..., bool]) -> bool:
-            return save_state(write, state, score, self._elapsed(), training.dataset_hash)
-
-        def validate(state: TrainState) -> bool:
-            """Gives a checkpoint its score; a signal meanwhile loses nothing but that."""
-            with self._clock("evaluate"):
-                score, heard = self._validate(state.params)
-            values = {self.metric: score, **heard}
-            metrics.write(int(state.step), {f"validation_{name}": value for name, value in values.items()})
-            self.console.print(
-                f"step {int(state.step)}: validation {self.metric} {score:.1%}{listening.describe(heard)}"
-            )
-            meta_updates = int(state.step) - self.method.imitation_steps
-            if 5 * meta_updates >= config.steps - self.method.imitation_steps and listening.is_deaf(heard):
-                self._warn(listening.advice(has_inner_step=self.config.method_name == "mil"))
-            with stop.deferred():
-                return save(state, score, checkpoints.replace)
-
-        def is_due(step: int) -> bool:
-            return step % config.eval_every == 0 or step >= config.steps
-
-        if step and is_due(step) and checkpoints.score(step) == UNVALIDATED:  # there was no time for it
-            written = validate(state)
-        with self._progress(config.steps) as progress:
-            bar = progress.add_task(
-                "meta-train", total=config.steps, completed=int(state.step), loss=float("nan"), rate=0
-            )
-            stopping, in_vain = False, 0
-            while step < config.steps and not stopping:
-                with stop.deferred():
-                    began = time.perf_counter()
-                    with self._clock("train"):
-                        state, values = run_steps(state, training.at(step), key)
-                        values = {name: float(value) for name, value in values.items()}
-                    rate = config.log_every / (time.perf_counter() - began)
-                    step += config.log_every
-                    metrics.write(step, {**values, "steps_per_s": rate})
-                    progress.update(bar, completed=step, loss=values["loss"], rate=rate)
-                    if values["skipped"]:
-                        self._warn(_describe_skipped(values, step))
-                    in_vain = in_vain + config.log_every if values["skipped"] == config.log_every else 0
-                    if in_vain >= MOST_IN_VAIN:
-                        last = "there is no checkpoint"
-                        if checkpoints.latest is not None:
-                            last = f"the last good checkpoint is of step {checkpoints.latest}"
-                        raise ValueError(f"train: no update of the last {in_vain} was finite; {last}")
-                    stopping = parallel.on_any_host(stop.asked)
-                    if is_due(step) or stopping:
-                        written = save(state, UNVALIDATED, checkpoints.save)
-                if is_due(step):  # all there is has been saved
-                    stopping = parallel.on_any_host(stop.asked)
-                    if written and not stopping:
-                        written = validate(state)
-        metrics.close()
-        latest = checkpoints.latest
-        checkpoints.close()
-        if not written:
-            going_on = "started again, the run goes on from there"
-            raise ValueError(f"checkpoints: the last one that could be written is of step {latest}; {going_on}")
-        if stopping:
-            print(f"milx: stopped at step {step}; the same command goes on from there", flush=True)
+        with contextlib.closing(Checkpoints(self._checkpoints, report=self._warn)) as checkpoints:
+            latest = checkpoints.latest
+            if latest is not None and latest >= config.steps and checkpoints.score(latest) != UNVALIDATED:
+                return
+            filters = self.config.network.fixed_filters
+            if filters not in (None, fixed_filters.KMEANS):
+                fixed_filters.load(filters, self.config.network)  # refuses a bad file before planning
+            compiled = self._compile_in_background()
+            training = self._load()
+            state, key = self._start(training, checkpoints)
+            with self.clock("compile"):
+                scan = compiled.result()
+            metrics = MetricsWriter(self.folder, int(state.step), self._warn)
+            with contextlib.closing(metrics), self._progress(config.steps, int(state.step)) as show:
+                hooks = self._hooks(metrics, show, training.dataset_hash)
+                state = loop.fit(scan, state, key, training, config, checkpoints, hooks, self.clock, stop)
+        if int(state.step) < config.steps:
+            print(f"milx: stopped at step {int(state.step)}; the same command goes on from there", flush=True)
             raise SystemExit(0)
+
+    def _hooks(self, metrics: MetricsWriter, show: Callable[..., None], dataset_hash: str) -> loop.Hooks:
+        config, first = self.config.train, self.method.imitation_steps
+
+        def log(step: int, values: dict[str, float]) -> None:
+            metrics.write(step, values)
+            show(completed=step, loss=values["loss"], rate=values["steps_per_s"])
+            if values["skipped"]:
+                self._warn(_describe_skipped(values, step))
+
+        def validate(state: TrainState) -> float:
+            step, (score, heard) = int(state.step), self._validate(state.params)
+            values = {self.metric: score, **heard}
+            metrics.write(step, {f"validation_{name}": value for name, value in values.items()})
+            self.console.print(f"step {step}: validation {self.metric} {score:.1%}{listening.describe(heard)}")
+            if 5 * (step - first) >= config.steps - first and listening.is_deaf(heard):
+                self._warn(listening.advice(has_inner_step=self.config.method_name == "mil"))
+            return score
+
+        def save(write: Callable[..., bool], state: TrainState, score: float) -> bool:
+            return save_state(write, state, score, self.clock.elapsed(), dataset_hash)
+
+        return loop.Hooks(log, validate, save)
 
     def _warn(self, message: str) -> None:
         self.console.print(f"[yellow]milx: {rich.markup.escape(message)}[/yellow]")
@@ -231,9 +192,9 @@ class Run(abc.ABC):
             raise ValueError(f"workdir: {self.folder} has no checkpoint yet; train first")
         items, _ = checkpoints.restore(step, {"params": self._params_like})
         _, extra = checkpoints.restore(checkpoints.latest, {})
-        self.seconds = extra["seconds"]
+        self.clock.seconds = extra["seconds"]
         found, draw = self._judge(items["params"])
-        result = results.describe(self.config, found, self._elapsed(), step, extra["dataset_hash"])
+        result = results.describe(self.config, found, self.clock.elapsed(), step, extra["dataset_hash"])
         results.write_json(self.folder / "evaluation.json", result)
         draw(result)
         return result
@@ -265,7 +226,7 @@ class Run(abc.ABC):
         """The state to train from, and the key of the batches."""
         state, batch_key = initial_state(self.trainer, self.config, training)
         if checkpoints.latest is not None:
-            state, self.seconds = restore_state(checkpoints, checkpoints.latest, state, training.dataset_hash)
+            state, self.clock.seconds = restore_state(checkpoints, checkpoints.latest, state, training.dataset_hash)
             self.console.print(f"continuing from step {int(state.step)}")
         return state, batch_key
 
@@ -283,20 +244,8 @@ class Run(abc.ABC):
             results.write_json(path, mine)
 
     @contextlib.contextmanager
-    def _clock(self, name: str) -> Iterator[None]:
-        """Adds the time spent to `seconds[name]`."""
-        began = time.perf_counter()
-        yield
-        self.seconds[name] += time.perf_counter() - began
-
-    def _elapsed(self) -> dict[str, float]:
-        """Seconds spent by this run so far, earlier sessions included."""
-        now = time.perf_counter()
-        self.seconds["total"] += now - self._began
-        self._began = now
-        return dict(self.seconds)
-
-    def _progress(self, steps: int) -> Progress:
+    def _progress(self, steps: int, done: int) -> Iterator[Callable[..., None]]:
+        """A bar on the console, and a function that updates it."""
         columns = (
             TextColumn("{task.description}"),
             BarColumn(),
@@ -304,4 +253,6 @@ class Run(abc.ABC):
             TextColumn("loss {task.fields[loss]:.4f}  {task.fields[rate]:.1f} steps/s"),
             TimeRemainingColumn(),
         )
-        return Progress(*columns, console=self.console)
+        with Progress(*columns, console=self.console) as progress:
+            bar = progress.add_task("meta-train", total=steps, completed=done, loss=float("nan"), rate=0)
+            yield functools.partial(progress.update, bar)

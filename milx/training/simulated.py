@@ -115,7 +115,7 @@ class SimulatedRun(Run):
 
     def demos(self, split: str) -> DemoSet:
         """The demonstrations of a split, planned or from the cache of earlier runs."""
-        with self._clock("demos"), self.console.status(f"planning {split} demonstrations"):
+        with self.clock("demos"), self.console.status(f"planning {split} demonstrations"):
             demos = split_demos(self.env, self.config, split)
         count, success = demos.success.size, float(demos.success.mean())
         self._demonstrations[split] = {"count": count, "success": success}
@@ -155,7 +155,7 @@ class SimulatedRun(Run):
 
     def _judge(self, params: Params) -> tuple[dict[str, Any], Callable[[dict[str, Any]], None]]:
         config, test = self.config, self.demos("test")
-        with self._clock("evaluate"):
+        with self.clock("evaluate"):
             floors = closed_loop.baselines(self.env, test, config.evaluation, config.data, trial_key("test"))
             trials, found = result_of(self.env, self.method, params, test, config, floors)
 

@@ -11,6 +11,7 @@ import pytest
 
 import milx
 from milx import methods
+from milx.config import assemble
 from milx.config.assemble import make_config
 from milx.deploy.policy import Policy
 from milx.export import export
@@ -33,16 +34,16 @@ print(json.dumps(sorted({name.split(".")[0] for name in sys.modules})))
 """
 
 
-def make_policy(method="mil", **mil):
+def make_policy(method="mil", **settings):
     """An untrained policy for small images, whose whitening is not the identity."""
     env = milx.make("reach", (16, 20))
     config = make_config("reach", method, "cpu")
     config.env.image_shape = (16, 20)
     config.network.filters, config.network.strides, config.network.fc_layers = (4, 4), (2, 2), (16,)
-    config.network.learned_loss = "linear" if mil.get("given", "") not in ("", "video+state+action") else None
-    config.network.hindsight_head = mil.get("given") == "video"
-    for name, value in mil.items():
-        setattr(config.mil, name, value)
+    if settings.get("given") == "video":
+        config.network.learned_loss, config.network.hindsight_head = "linear", True
+    for name, value in settings.items():
+        assemble.assign(config, f"method.{name}", value)
     spec = env.spec
     whitening = Whitening(jnp.full(8, 0.2), jnp.full(8, 2.0), jnp.full(2, 0.1), jnp.full(2, 0.3))
     made = methods.make(config, spec)

@@ -32,7 +32,7 @@ def test_a_cell_is_a_run(trained, tmp_path, monkeypatch):
         runner.run({"cell": config})
     runner = cells.Cells(tmp_path, trained.config.data.tasks)  # as in another process
     runner.run({"cell": config})
-    assert saved == [2, 4, 6]  # it has gone on from there
+    assert saved == [2, 2, 4, 4, 6, 6]  # it has gone on from there; each is saved before and after its validation
     assert sorted(path.name for path in tmp_path.iterdir()) == ["cell.json", "unfinished"]
     assert not list((tmp_path / "unfinished").iterdir())
     result = cells.read(tmp_path)["cell"]

@@ -221,7 +221,7 @@ def test_updates_that_are_not_finite_are_skipped_counted_and_named(folder, tmp_p
 
 def test_a_run_without_a_finite_update_stops(folder, tmp_path, monkeypatch):
     run, _ = run_with_losses(folder, tmp_path, monkeypatch, lambda n: jnp.inf * jnp.ones_like(n, jnp.float32))
-    monkeypatch.setattr("milx.training.run.MOST_IN_VAIN", 30)  # after two scans of 20
+    monkeypatch.setattr("milx.training.loop.MOST_IN_VAIN", 30)  # after two scans of 20
     with pytest.raises(ValueError, match="no update of the last 40 was finite; there is no checkpoint"):
         run.train()
 
