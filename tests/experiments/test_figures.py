@@ -2,17 +2,16 @@
 
 import dataclasses
 import pathlib
+import re
 import sys
 
 import pytest
 
 sys.path.insert(0, str(pathlib.Path(__file__).parents[2] / "experiments" / "paper"))
-import ablations
 import cells
 import figure3
-import published
+import pages
 import published_rows
-import table
 import table1
 import table2
 import table3
@@ -71,21 +70,13 @@ def test_a_table_shows_means_intervals_floors_and_every_criterion(flags):
     assert lines[-1].startswith("50 trials for each seed")
 
 
-def test_readme_shows_what_the_scripts_print(flags):
-    """Line by line; where there are several criteria, those of the first."""
-    root = pathlib.Path(__file__).parents[2]
-    readme, results = (root / "README.md").read_text().splitlines(), root / "experiments" / "results"
-    printed = [table.markdown(results / name) for name in ("reach", "push")]
-    for one in (table1, table2, table3):
-        found = cells.read(results / one.TABLE.folder)
-        printed.append(tables.markdown(one.TABLE, list(one.TABLE.rows), found).split("\n\n")[0])
-    printed.append(ablations.markdown(cells.read(results / "ablations"), list(ablations.ABLATIONS), seeds=2))
-    printed.append(figure := figure3.markdown(list(cells.read(results / "figure3").values())))
-    printed.append(figure3.markdown(list(cells.read(results / "figure3_push").values())))
-    lines = [line for text in printed for line in text.splitlines()]
-    assert len(lines) > 50
-    assert [line for line in lines if line not in readme] == []
-    assert figure in (root / "BUILD.md").read_text()
+def test_pages_show_what_the_result_files_hold(flags):
+    marked = [
+        name for page in pages.PAGES for name in re.findall("<!-- ([^ ]+) -->", page.read_text()) if name != "end"
+    ]
+    assert sorted(marked) == sorted(pages.TABLES)
+    for page in pages.PAGES:
+        assert pages.filled(page.read_text()) == page.read_text(), f"{page}: run experiments/paper/pages.py"
 
 
 @pytest.fixture
@@ -125,7 +116,7 @@ def test_intervals_of_one_table_are_of_one_kind():
     assert tables.interval([over_things, result(500, 0.6, 0.5, 0.7)]) == "70.0% (50.0% to 85.0%; 2)"
 
 
-def test_results_of_the_published_method_are_of_their_rows_and_in_the_docs():
+def test_results_of_the_published_method_are_of_their_rows():
     root = pathlib.Path(__file__).parents[2]
     for table_name, rows in published_rows.TABLES.items():
         folder = root / "experiments" / "results" / f"paper_{table_name}"
@@ -133,6 +124,3 @@ def test_results_of_the_published_method_are_of_their_rows_and_in_the_docs():
             for path in folder.glob(f"{name}-[0-9]-[0-9].json"):
                 shots, seed = (int(part) for part in path.stem.split("-")[-2:])
                 assert cells.Cells(folder, 1).is_done(path.stem, published_rows.configure(row, shots, seed))
-    results = root / "experiments" / "results" / "paper_results"
-    printed = published.markdown(published_rows.TABLES["results"], cells.read(results))
-    assert printed in (root / "docs" / "paper.md").read_text()

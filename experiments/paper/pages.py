@@ -1,0 +1,95 @@
+"""Writes the tables of README and docs/results/ from the result files, between <!-- NAME --> and <!-- end -->.
+
+python experiments/paper/pages.py    # after new results; a test says when it has been forgotten
+"""
+
+import pathlib
+import re
+import statistics
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import ablations
+import cells
+import figure3
+import published
+import table
+import table1
+import table2
+import table3
+import tables
+from absl import app
+
+ROOT = pathlib.Path(__file__).parents[2]
+RESULTS = ROOT / "experiments" / "results"
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs" / "results").glob("*.md"))]
+sys.path.insert(0, str(ROOT / "experiments" / "benchmarks"))
+import summary  # noqa: E402
+
+
+def headline() -> str:
+    """One row for each environment and method, of all seeds."""
+    fast, of_push, of_place = (cells.read(RESULTS / name) for name in ("reach", "table1", "table3"))
+    rows = {
+        "reach, MIL": (_named(cells.read(RESULTS / "paper_results"), "reach-1"), "a curve"),
+        "reach, MIL + goal head": (_named(fast, "mil-fast"), "a curve"),
+        "push, MIL + goal head": (_named(of_push, "mil-video-state-action-1"), "80.6%"),
+        "place, MIL + goal head": (_named(of_place, "mil-1"), "90%"),
+    }
+    lines = ["| | success (95%; seeds) | random | task-blind | expert | paper |", "|---|---|---|---|---|---|"]
+    for label, (runs, paper) in rows.items():
+        floors = [
+            f"{statistics.mean(run['baselines'][name] for run in runs):.1%}"
+            for name in ("random", "task_blind", "expert")
+        ]
+        lines.append(f"| {label} | {tables.interval(runs)} | {' | '.join(floors)} | {paper} |")
+    return "\n".join(lines)
+
+
+def _named(found: dict[str, dict[str, Any]], name: str) -> list[dict[str, Any]]:
+    return [run for cell, run in found.items() if re.fullmatch(rf"{name}-(seed)?\d", cell)]
+
+
+def _paper_table(which: tables.Table) -> str:
+    """By the first of its criteria."""
+    return tables.markdown(which, list(which.rows), cells.read(RESULTS / which.folder)).split("\n\n")[0]
+
+
+TABLES: dict[str, Callable[[], str]] = {
+    "headline": headline,
+    "reach": lambda: table.markdown(RESULTS / "reach"),
+    "push": lambda: table.markdown(RESULTS / "push"),
+    "table1": lambda: _paper_table(table1.TABLE),
+    "table2": lambda: _paper_table(table2.TABLE),
+    "table3": lambda: _paper_table(table3.TABLE),
+    "published": lambda: published.markdown(published.TABLES["results"], cells.read(RESULTS / "paper_results")),
+    "figure3": lambda: figure3.markdown(list(cells.read(RESULTS / "figure3").values())),
+    "figure3-push": lambda: figure3.markdown(list(cells.read(RESULTS / "figure3_push").values())),
+    "ablations": lambda: ablations.markdown(cells.read(RESULTS / "ablations"), list(ablations.ABLATIONS), seeds=2),
+    "benchmarks": lambda: summary.table(list(cells.read(RESULTS / "benchmarks").values())),
+}
+"""What makes the table of each name."""
+
+
+def filled(text: str) -> str:
+    """A page with its tables as the result files have them now."""
+    return re.sub(r"<!-- ([\w-]+) -->\n.*?<!-- end -->", lambda found: f"{_marked(found[1])}", text, flags=re.DOTALL)
+
+
+def _marked(name: str) -> str:
+    return f"<!-- {name} -->\n{TABLES[name]()}\n<!-- end -->"
+
+
+def main(_: list[str]) -> None:
+    """Rewrites the pages."""
+    for page in PAGES:
+        before = page.read_text()
+        after = filled(before)
+        if after != before:
+            page.write_text(after)
+            print(page.relative_to(ROOT))
+
+
+if __name__ == "__main__":
+    app.run(main)
