@@ -12,7 +12,7 @@ from milx.config.check import check_config
 from milx.config.schema import Config
 from milx.core import pytrees
 from milx.training import command_line
-from milx.training.simulated import split_demos
+from milx.training.simulated import demos_of_split
 from milx.types import SPLITS
 
 
@@ -21,7 +21,7 @@ def main(config: Config, workdir: str) -> None:
     check_config(config)
     env = envs.make(config.env_name, config.env.image_shape, config.env.action_cost)
     for split in SPLITS:
-        demos = split_demos(env, config, split)
+        demos = demos_of_split(env, config, split)
         path = pathlib.Path(workdir) / f"{split}.npz"
         pytrees.save(path, demos)
         print(f"{path}: {demos.num_tasks} tasks x {demos.num_demos}, {float(demos.success.mean()):.1%} succeed")

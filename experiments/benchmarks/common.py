@@ -54,7 +54,7 @@ class Report:
         value = "not run" if median is None else f"{median:,.4g} {unit}"
         print(f"{self.benchmark:10s} {name:60s} {value:>20s} {note}", flush=True)
         self.folder.mkdir(parents=True, exist_ok=True)
-        content = {"benchmark": self.benchmark, **provenance.describe(), "rows": self.rows}
+        content = {"benchmark": self.benchmark, **provenance.origin(), "rows": self.rows}
         content["versions"] |= provenance.versions(("torch", "warp-lang"))
         file = self.benchmark if ACCELERATED else f"{self.benchmark}-cpu"
         (self.folder / f"{file}.json").write_text(json.dumps(content, indent=1) + "\n")

@@ -29,7 +29,7 @@ from milx.data.simulated import DemoSet
 from milx.evaluation import closed_loop, listening, provenance, results
 from milx.training import loop, signals
 from milx.training.metrics import MetricsWriter, read_metrics
-from milx.training.simulated import result_of, split_demos, training_on, trial_key, validation_of
+from milx.training.simulated import demos_of_split, result_of, training_on, trial_key, validation_of
 from milx.training.state import Training, check_steps, initial_state, restore_state, save_state
 from milx.training.update import Trainer, TrainState, make_optimizer
 from milx.types import Params
@@ -164,7 +164,7 @@ class Cells:
         seconds = {"demos": demos_s, **trained.seconds, "evaluate": trained.seconds["evaluate"] + evaluate_s}
         seconds["total"] = sum(seconds.values())
         digest = pytrees.fingerprint(train)
-        result = results.describe(config, found, seconds, trained.step, digest)
+        result = results.compose(config, found, seconds, trained.step, digest)
         return result | {"validation_success": trained.validation, "curve": trained.curve}
 
     def write(self, name: str, result: dict[str, Any]) -> None:
@@ -207,7 +207,7 @@ class Cells:
 
     def _unfinished(self, config: Config, dataset_hash: str) -> pathlib.Path:
         """Where a cell's checkpoints are until it has its file: a folder for all on which they depend."""
-        contents = json.dumps([_contents(config), dataset_hash, provenance.describe()])
+        contents = json.dumps([_contents(config), dataset_hash, provenance.origin()])
         return self.folder / "unfinished" / hashlib.sha256(contents.encode()).hexdigest()[:16]
 
     def _fit(self, name: str, config: Config, training: Training, checkpoints: Checkpoints) -> Trained:
@@ -232,7 +232,7 @@ class Cells:
             success, heard = validation_of(env, trainer.method, state.params, validation, evaluation)
             metrics.write(step, losses | {"validation_success": success, **heard})
             said = "".join(f"loss {loss:.3f}, " for loss in losses.values())
-            print(f"  {name} {step}: {said}validation {success:.1%}{listening.describe(heard)}", flush=True)
+            print(f"  {name} {step}: {said}validation {success:.1%}{listening.in_words(heard)}", flush=True)
             return success
 
         hooks = loop.Hooks(
@@ -277,7 +277,7 @@ class Cells:
         whole = dataclasses.replace(config, data=dataclasses.replace(config.data, tasks=self.capacity))
         env = self._env(config)
         which = config.seed if split == "train" else config.evaluation.shots
-        return self._once(("demos", env, split, which), lambda: split_demos(env, whole, split))
+        return self._once(("demos", env, split, which), lambda: demos_of_split(env, whole, split))
 
     def _once(self, key: Any, make: Callable[[], Any]) -> Any:
         if key not in self._made:

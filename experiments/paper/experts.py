@@ -69,7 +69,7 @@ def main(_: list[str]) -> None:
         path = folder / f"push-{name}.json"
         if not path.is_file():
             contents = {"expert": name, "scenes": _SCENES.value, "ilqr_iterations": EXPERTS[name]}
-            results.write_json(path, contents | {"runs": compare(name, _SCENES.value)} | provenance.describe())
+            results.write_json(path, contents | {"runs": compare(name, _SCENES.value)} | provenance.origin())
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ def main(run: str, name: str) -> None:
     """Copies the run's best parameters and its result."""
     milx.configure()
     result = json.loads((pathlib.Path(run) / "evaluation.json").read_text())
-    pretrained.save(policy.load(run), result, pretrained.FOLDER / name)
+    pretrained.save(policy.load_run(run), result, pretrained.FOLDER / name)
     size = (pretrained.FOLDER / name / "params.npz").stat().st_size
     print(f"{name}: {result['success']:.1%}, {size / 1e6:.2f} MB")
 

@@ -58,7 +58,7 @@ def main(_: list[str]) -> None:
                     trained = runner.train(name, config)
                     row: dict[str, Any] = {"env": env, "method": method, "candidate": candidate}
                     row |= {"validation_success": trained.validation, "wall_clock_s": trained.seconds}
-                    runner.write(name, row | {"config": assemble.to_dict(config)} | provenance.describe())
+                    runner.write(name, row | {"config": assemble.to_dict(config)} | provenance.origin())
                     runner.forget()
             found = cells.read(folder)
             shown = [f"{found[name]['validation_success']:.1%}" if name in found else "" for name in names.values()]

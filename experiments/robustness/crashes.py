@@ -67,7 +67,7 @@ def finish(data: pathlib.Path, workdir: pathlib.Path) -> str:
         raise RuntimeError(out[-2000:])
     run = RecordedRun(assemble.read(workdir / "config.json"), workdir, Console(quiet=True))
     checkpoints = Checkpoints(workdir / "checkpoints", read_only=True)
-    params = policy.load(workdir).params
+    params = policy.load_run(workdir).params
     trainer = jax.ShapeDtypeStruct((), np.int32), jax.eval_shape(run.trainer.optimizer.init, params)
     items, _ = checkpoints.restore(STEPS, {"params": params, "trainer": trainer})
     return pytrees.fingerprint({**items, "best": np.array(checkpoints.best)})
@@ -161,7 +161,7 @@ def main(_: list[str]) -> None:
     same = {"rounds": rounds, "kills": len(kills), "while_writing": sum(found["while_writing"] for found in kills)}
     report = {"same_parameters": same, "undisturbed_s": round(longest, 1), "kills": kills, "terminations": terms}
     pathlib.Path(_OUT.value).mkdir(parents=True, exist_ok=True)
-    results.write_json(pathlib.Path(_OUT.value) / "crashes-cpu.json", report | provenance.describe())
+    results.write_json(pathlib.Path(_OUT.value) / "crashes-cpu.json", report | provenance.origin())
     print(same)
 
 

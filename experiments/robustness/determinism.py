@@ -59,7 +59,7 @@ def train(command: list[str], workdir: pathlib.Path, environment: dict[str, str]
     done = subprocess.run(command, env=environment, capture_output=True, text=True)
     if done.returncode:
         raise RuntimeError(done.stdout[-1000:] + done.stderr[-1000:])
-    digest = pytrees.fingerprint(policy.load(workdir).params)
+    digest = pytrees.fingerprint(policy.load_run(workdir).params)
     return Outcome(digest, np.array([line["loss"] for line in metrics(workdir) if "loss" in line]))
 
 
@@ -104,7 +104,7 @@ def main(_: list[str]) -> None:
                 rows.append(row)
                 print(json.dumps(row), flush=True)
                 file = f"determinism{'-cpu' if jax.default_backend() == 'cpu' else ''}.json"
-                results.write_json(folder / file, {"rows": rows} | provenance.describe())
+                results.write_json(folder / file, {"rows": rows} | provenance.origin())
 
 
 if __name__ == "__main__":

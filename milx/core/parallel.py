@@ -68,11 +68,11 @@ def round_up(size: int) -> int:
 
 
 def largest(x: jax.Array) -> jax.Array:
-    """The largest of the devices' scalars; to be called inside what `split_tasks` runs."""
+    """The largest of the devices' scalars; to be called inside what `shard_tasks` runs."""
     return jax.lax.pmax(x, AXIS)
 
 
-def split_tasks(function: Callable[..., Any], *, shared: int = 0, average: bool = False) -> Callable[..., Any]:
+def shard_tasks(function: Callable[..., Any], *, shared: int = 0, average: bool = False) -> Callable[..., Any]:
     """Runs `function` on every device with its share of the tasks.
 
     Args:

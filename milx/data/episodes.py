@@ -92,7 +92,7 @@ def write(
     tasks: dict[str, list[Episode]] = {}
     for episode in episodes:
         tasks.setdefault(episode.task, []).append(episode)
-    splits = split_tasks(sorted(tasks), *held_out)
+    splits = assign_splits(sorted(tasks), *held_out)
     with Writer(out, *sizes, source) as writer:
         for name in track(sorted(tasks), "writing tasks"):
             own = tasks[name]
@@ -100,7 +100,7 @@ def write(
             writer.add(name, splits[name], [episode.length for episode in own], demos)
 
 
-def split_tasks(names: list[str], validation: float, test: float) -> dict[str, str]:
+def assign_splits(names: list[str], validation: float, test: float) -> dict[str, str]:
     """The split of every task, in an order that depends on nothing but the names; at least one trains.
 
     Raises:

@@ -37,7 +37,7 @@ class Recorded:
 
 
 def shape_of(data: DataSet, num_tasks: int, num_demos: int, horizon: int) -> Recorded:
-    """Shapes and types of `load`'s result."""
+    """Shapes and types of `read_demos`'s result."""
     lead, head = (num_tasks, num_demos, horizon), data.header
     image = None if head.image_shape is None else jax.ShapeDtypeStruct((*lead, *head.image_shape, 3), np.uint8)
     state, action = (jax.ShapeDtypeStruct((*lead, size), np.float32) for size in (head.state_size, head.action_size))
@@ -45,7 +45,7 @@ def shape_of(data: DataSet, num_tasks: int, num_demos: int, horizon: int) -> Rec
     return Recorded(jax.ShapeDtypeStruct((num_tasks,), np.int32), Demo(image, state, action), which, which)
 
 
-def load(data: DataSet, tasks: Sequence[int], demos: Sequence[Sequence[int]], horizon: int) -> Recorded:
+def read_demos(data: DataSet, tasks: Sequence[int], demos: Sequence[Sequence[int]], horizon: int) -> Recorded:
     """Reads demonstrations, all at once, as NumPy arrays.
 
     Args:
@@ -172,7 +172,7 @@ class Shards:
 
     def _load(self, scan: int) -> Recorded:
         tasks, demos = self.chosen(scan)
-        loaded = load(self.data, tasks, demos, self.horizon)
+        loaded = read_demos(self.data, tasks, demos, self.horizon)
         fill = self.num_demos - loaded.there.shape[1]  # as large as every shard
         pad = lambda x: np.pad(x, [(0, 0), (0, fill)] + [(0, 0)] * (x.ndim - 2)) if x.ndim > 1 else x  # noqa: E731
         return jax.device_put(jax.tree.map(pad, loaded))

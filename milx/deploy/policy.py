@@ -93,7 +93,7 @@ class Policy:
         return jax.jit(self.method.act)
 
 
-def load(run: str | pathlib.Path) -> Policy:
+def load_run(run: str | pathlib.Path) -> Policy:
     """Loads the best policy of a run.
 
     Args:

@@ -35,7 +35,7 @@ def load(run: str | pathlib.Path) -> Policy:
     """
     is_run = (pathlib.Path(run) / "config.json").is_file()
     if is_run or (pathlib.Path(run).exists() and run not in names()):
-        return policy.load(run)
+        return policy.load_run(run)
     if run not in names():
         expected = f"the folder of a run, or one of {', '.join(names())}, which ship with milx"
         raise ValueError(f"run: got {str(run)!r}, expected {expected}")

@@ -81,7 +81,7 @@ def _run_batch(
         task_params = map_in_groups(adapt, (shown, states, action), _tasks_at_once(env, action))
         return jax.vmap(jax.vmap(trial, in_axes=(None, None, 0, 0)))(task_params, task, scene, key)
 
-    return parallel.split_tasks(run_tasks, shared=1)(params, task, shown, states, action, scene, key)
+    return parallel.shard_tasks(run_tasks, shared=1)(params, task, shown, states, action, scene, key)
 
 
 def _tasks_at_once(env: Env, action: jax.Array) -> int:
@@ -134,7 +134,7 @@ def _listen(env: Env, method: Method, params: Params, demos: DemoSet, shots: int
     def render(task: Task, states: State, action: jax.Array) -> Demo:
         return jax.vmap(functools.partial(render_demo, env, task))(states, action)
 
-    shown = parallel.split_tasks(jax.vmap(render))(demos.task, demos.states, demos.action)
+    shown = parallel.shard_tasks(jax.vmap(render))(demos.task, demos.states, demos.action)
     batch = TaskBatch(jax.tree.map(lambda x: x[:, :shots], shown), jax.tree.map(lambda x: x[:, shots:], shown))
     return listening.measure(method, params, batch, _tasks_at_once(env, demos.action[:, :shots]))
 
@@ -156,7 +156,7 @@ def listen(env: Env, method: Method, params: Params, demos: DemoSet, shots: int)
 class Floors(NamedTuple):
     """Success rates of "random" actions, the "task_blind" expert, and the "expert".
 
-    `describe` adds the policy's own with another task's demonstration, "other_demo".
+    `summarize` adds the policy's own with another task's demonstration, "other_demo".
 
     Attributes:
         success: by name.
@@ -210,7 +210,7 @@ def film(camera: Env, task: Task, states: State) -> jax.Array:
     return jax.vmap(camera.film)(task, states)
 
 
-def describe(env: Env, config: Config, task: Task, trials: Trials, misled: Trials, floors: Floors) -> dict[str, Any]:
+def summarize(env: Env, config: Config, task: Task, trials: Trials, misled: Trials, floors: Floors) -> dict[str, Any]:
     """What the result file of a run says of its evaluation: what was asked and what came out, by every criterion.
 
     Args:

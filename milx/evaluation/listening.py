@@ -54,15 +54,15 @@ def measure(method: Method, params: Params, batch: TaskBatch, most: int | None =
     def error_before(prior: Params, query: Demo) -> jax.Array:
         return map_in_groups(functools.partial(_squared_error, method, prior), (query,), most)
 
-    adapted = parallel.split_tasks(adapt, shared=1)(params, batch.support)
-    on_each = parallel.split_tasks(error)
+    adapted = parallel.shard_tasks(adapt, shared=1)(params, batch.support)
+    on_each = parallel.shard_tasks(error)
     errors = {"own_demo": on_each(adapted, batch.query)}
     if len(batch.query.action) > 1:
         of_next = jax.tree.map(lambda x: jnp.roll(x, -1, axis=0), adapted)
         errors["other_demo"] = on_each(of_next, batch.query)
     prior = method.unadapted(params)
     if prior is not None:
-        errors["no_demo"] = parallel.split_tasks(error_before, shared=1)(prior, batch.query)
+        errors["no_demo"] = parallel.shard_tasks(error_before, shared=1)(prior, batch.query)
     action = batch.query.action
     variance = jnp.maximum(jnp.var(action.reshape(-1, action.shape[-1]), axis=0), MIN_STD**2)
     found = {name: (value.mean(axis=0) / variance).mean() for name, value in errors.items()}
@@ -82,7 +82,7 @@ def advice(has_inner_step: bool) -> str:
     return f"the policy does not listen: another task's demonstration does as well as its own. Try {remedies}"
 
 
-def describe(found: dict[str, float]) -> str:
+def in_words(found: dict[str, float]) -> str:
     """The errors of `measure` for people, to be put behind something else."""
     parts = [f"{found[name]:.2f} with {words}" for name, words in ERRORS.items() if name in found]
     return f"; error of the actions {', '.join(parts)} demonstration" if parts else ""

@@ -13,7 +13,7 @@ import jax
 _PACKAGES = ("milx", "jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "orbax-checkpoint", "numpy")
 
 
-def describe() -> dict[str, Any]:
+def origin() -> dict[str, Any]:
     """Commit (with "-dirty" for a changed tree; None outside a checkout), hardware and versions, for a result file."""
     return {"commit": _commit(), "hardware": _hardware(), "versions": versions(_PACKAGES)}
 

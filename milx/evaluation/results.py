@@ -10,14 +10,14 @@ from milx.config.schema import Config
 from milx.evaluation import provenance
 
 
-def describe(
+def compose(
     config: Config, found: dict[str, Any], seconds: dict[str, float], step: int, dataset_hash: str
 ) -> dict[str, Any]:
     """A result as its JSON file holds it: what was run, what came out, what it took, and where.
 
     Args:
         config: what was run.
-        found: what the evaluation says (`evaluator.describe`).
+        found: what the evaluation says (`closed_loop.summarize`).
         seconds: wall-clock by part.
         step: meta-updates of the checkpoint that was evaluated.
         dataset_hash: `fingerprint` of the training demonstrations.
@@ -33,7 +33,7 @@ def describe(
         "steps": step,
         "config": assemble.to_dict(config),
         "dataset_hash": dataset_hash,
-        **provenance.describe(),
+        **provenance.origin(),
     }
 
 

@@ -17,7 +17,7 @@ from milx.networks.policy_network import Controller, PolicyOutput
 _HOPS = 2
 
 
-def split_objects(state: jax.Array, object_indices: tuple[tuple[int, ...], ...]) -> tuple[jax.Array, jax.Array]:
+def separate_objects(state: jax.Array, object_indices: tuple[tuple[int, ...], ...]) -> tuple[jax.Array, jax.Array]:
     """The objects' places [.., O, 2] and all other entries of states [.., S]."""
     places = np.array(object_indices)
     rest = np.setdiff1d(np.arange(state.shape[-1]), places)
@@ -33,7 +33,7 @@ class ObjectTokens(nn.Module):
     @nn.compact
     def __call__(self, image: jax.Array | None, state: jax.Array, action: jax.Array) -> jax.Array:
         """Maps whitened states [T, S] and actions [T, A] to tokens [T, O, D]; an image is not looked at."""
-        places, robot = split_objects(state, self.object_indices)
+        places, robot = separate_objects(state, self.object_indices)
         steps, count = places.shape[:2]
         number = jnp.broadcast_to(jnp.eye(count, dtype=state.dtype), (steps, count, count))
         time = jnp.linspace(0, 1, steps, dtype=state.dtype)[:, None]
@@ -55,7 +55,7 @@ class AttentiveActor(nn.Module):
     @nn.compact
     def __call__(self, tokens: jax.Array, image: jax.Array | None, state: jax.Array) -> PolicyOutput:
         """Maps tokens [T, O, D] and whitened states [B, S] to actions; an image is not looked at."""
-        places, robot = split_objects(state, self.object_indices)
+        places, robot = separate_objects(state, self.object_indices)
         batch, count = places.shape[:2]
         size = tokens.shape[-1]
         cell = nn.OptimizedLSTMCell(self.config.context, param_dtype=state.dtype)

@@ -34,7 +34,7 @@ class Filters(NamedTuple):
     bias: np.ndarray
 
 
-def load(path: str, config: NetworkConfig) -> Filters:
+def read_filters(path: str, config: NetworkConfig) -> Filters:
     """VGG-19's first convolution from a .npz or .safetensors file with torchvision's names.
 
     The image's normalisation becomes part of it. At the border it sees black where VGG-19 sees grey.

@@ -18,7 +18,7 @@ from milx.config import assemble
 from milx.config.check import check_config
 from milx.config.schema import GIVEN, Config
 from milx.data.dataset import DataSet, spread
-from milx.data.recorded import MOST_DEMOS, Recorded, Shards, load, sample_batch, with_goals
+from milx.data.recorded import MOST_DEMOS, Recorded, Shards, read_demos, sample_batch, with_goals
 from milx.evaluation import plots, results
 from milx.evaluation.open_loop import task_errors
 from milx.methods import whitening
@@ -216,7 +216,7 @@ class RecordedRun(Run):
         numbers = sorted(range(len(info.lengths)), key=lambda i: info.has_action[i] and not self.given_action)
         shown = [i for i in numbers if info.has_action[i] or not self.given_action][:shots]
         asked = [i for i in numbers if info.has_action[i] and i not in shown][: MOST_DEMOS - shots]
-        recorded = jax.tree.map(lambda x: x[0], load(self.data, [task], [[*shown, *asked]], horizon))
+        recorded = jax.tree.map(lambda x: x[0], read_demos(self.data, [task], [[*shown, *asked]], horizon))
         support = jax.tree.map(lambda x: x[:shots], recorded.demo)
         fill = MOST_DEMOS - len(shown) - len(asked)
         rest = lambda x: np.pad(x[shots:], [(0, fill)] + [(0, 0)] * (x.ndim - 1))  # noqa: E731

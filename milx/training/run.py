@@ -140,7 +140,7 @@ class Run(abc.ABC):
                 return
             filters = self.config.network.fixed_filters
             if filters not in (None, fixed_filters.KMEANS):
-                fixed_filters.load(filters, self.config.network)  # refuses a bad file before planning
+                fixed_filters.read_filters(filters, self.config.network)  # refuses a bad file before planning
             compiled = self._compile_in_background()
             training = self._load()
             state, key = self._start(training, checkpoints)
@@ -167,7 +167,7 @@ class Run(abc.ABC):
             step, (score, heard) = int(state.step), self._validate(state.params)
             values = {self.metric: score, **heard}
             metrics.write(step, {f"validation_{name}": value for name, value in values.items()})
-            self.console.print(f"step {step}: validation {self.metric} {score:.1%}{listening.describe(heard)}")
+            self.console.print(f"step {step}: validation {self.metric} {score:.1%}{listening.in_words(heard)}")
             if 5 * (step - first) >= config.steps - first and listening.is_deaf(heard):
                 self._warn(listening.advice(has_inner_step=self.config.method_name == "mil"))
             return score
@@ -194,7 +194,7 @@ class Run(abc.ABC):
         _, extra = checkpoints.restore(checkpoints.latest, {})
         self.clock.seconds = extra["seconds"]
         found, draw = self._judge(items["params"])
-        result = results.describe(self.config, found, self.clock.elapsed(), step, extra["dataset_hash"])
+        result = results.compose(self.config, found, self.clock.elapsed(), step, extra["dataset_hash"])
         results.write_json(self.folder / "evaluation.json", result)
         draw(result)
         return result

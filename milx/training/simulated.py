@@ -32,7 +32,7 @@ EVALUATION_SEED = 2017
 """Validation and test tasks and their trials are the same for every seed of a run."""
 
 
-def split_demos(env: envs.Env, config: Config, split: str) -> DemoSet:
+def demos_of_split(env: envs.Env, config: Config, split: str) -> DemoSet:
     """The demonstrations of a split as a run uses them, planned or from the cache of earlier runs."""
     num_tasks, num_demos = {
         "train": (config.data.tasks, config.data.demos_per_task),
@@ -81,7 +81,7 @@ def result_of(
     """The trials of the test tasks, and what the result file says of them."""
     trials = closed_loop.run_trials(env, method, params, demos, config.evaluation, trial_key("test"))
     misled = closed_loop.run_trials(env, method, params, demos, config.evaluation, trial_key("test"), misled=True)
-    return trials, closed_loop.describe(env, config, demos.task, trials, misled, floors)
+    return trials, closed_loop.summarize(env, config, demos.task, trials, misled, floors)
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -116,7 +116,7 @@ class SimulatedRun(Run):
     def demos(self, split: str) -> DemoSet:
         """The demonstrations of a split, planned or from the cache of earlier runs."""
         with self.clock("demos"), self.console.status(f"planning {split} demonstrations"):
-            demos = split_demos(self.env, self.config, split)
+            demos = demos_of_split(self.env, self.config, split)
         count, success = demos.success.size, float(demos.success.mean())
         self._demonstrations[split] = {"count": count, "success": success}
         self.console.print(f"{count} {split} demonstrations, of which {success:.1%} succeed")

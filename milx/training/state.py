@@ -48,7 +48,7 @@ def initial_state(trainer: Trainer, config: Config, training: Training) -> tuple
     if config.network.fixed_filters == fixed_filters.KMEANS:
         filters = fixed_filters.cluster(training.first_images(), config.network)
     else:
-        filters = fixed_filters.load(config.network.fixed_filters, config.network)
+        filters = fixed_filters.read_filters(config.network.fixed_filters, config.network)
     return dataclasses.replace(state, params=fixed_filters.put(state.params, filters)), batch_key
 
 

@@ -121,7 +121,7 @@ class Trainer:
             bad = parallel.largest(jnp.where(jnp.isfinite(metrics["loss"]), -1, task).max())
             return grad, {**jax.tree.map(jnp.mean, metrics), "bad_task": bad}
 
-        split = parallel.split_tasks(gradient, shared=3, average=True)
+        split = parallel.shard_tasks(gradient, shared=3, average=True)
         grad, metrics = split(state.params, data, state.step, self._keys(key, state.step))
         metrics["grad_norm"] = optax.tree.norm(grad)
         good = jnp.isfinite(metrics["grad_norm"]) & jnp.isfinite(metrics["loss"])
@@ -163,7 +163,7 @@ class Trainer:
         state, metrics = jax.lax.scan(lambda s, _: self.update(s, data, key), state, length=steps)
         skipped, bad_task = metrics.pop("skipped").sum(), metrics.pop("bad_task").max()
         means = {name: value.sum() / jnp.maximum(steps - skipped, 1) for name, value in metrics.items()}
-        batch = parallel.split_tasks(self.sample, shared=1)(data, self._keys(key, state.step))
+        batch = parallel.shard_tasks(self.sample, shared=1)(data, self._keys(key, state.step))
         return state, {
             **means,
             **listening.measure(self.method, state.params, batch),

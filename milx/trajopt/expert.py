@@ -117,7 +117,7 @@ def _perform_planned(env: Env, options: Options, noise: float, *batch: Any) -> t
     def one(noise: float, task: Task, state: State, key: jax.Array) -> tuple[State, jax.Array]:
         return demonstrate(env, task, state, follow(plan(env, task, state, options)), key, noise)
 
-    return parallel.split_tasks(jax.vmap(one, in_axes=(None, 0, 0, 0)), shared=1)(noise, *batch)
+    return parallel.shard_tasks(jax.vmap(one, in_axes=(None, 0, 0, 0)), shared=1)(noise, *batch)
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -125,7 +125,7 @@ def _perform_controlled(env: Env, noise: float, *batch: Any) -> tuple[State, jax
     def one(noise: float, task: Task, state: State, tactic: jax.Array, key: jax.Array) -> tuple[State, jax.Array]:
         return demonstrate(env, task, state, lambda state, _: env.control(task, state, tactic), key, noise)
 
-    return parallel.split_tasks(jax.vmap(one, in_axes=(None, 0, 0, 0, 0)), shared=1)(noise, *batch)
+    return parallel.shard_tasks(jax.vmap(one, in_axes=(None, 0, 0, 0, 0)), shared=1)(noise, *batch)
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -135,4 +135,4 @@ def judge(env: Env, task: Task, states: State) -> tuple[jax.Array, dict[str, jax
     def one(task: Task, states: State) -> tuple[jax.Array, dict[str, jax.Array]]:
         return env.success(task, states), env.other_criteria(task, states)
 
-    return parallel.split_tasks(jax.vmap(one))(task, states)
+    return parallel.shard_tasks(jax.vmap(one))(task, states)

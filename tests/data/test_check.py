@@ -9,7 +9,7 @@ from rich.console import Console
 
 from milx.data import check
 from milx.data.dataset import DataSet, Writer
-from milx.data.episodes import split_tasks
+from milx.data.episodes import assign_splits
 from milx.types import Demo
 
 RNG = np.random.default_rng(0)
@@ -104,17 +104,17 @@ def test_names_of_tasks_are_shown_as_they_are(tmp_path, capsys):
 def test_some_task_always_trains():
     for count in range(3, 9):
         for validation in (0.1, 0.3, 0.4, 0.49):
-            splits = list(split_tasks([f"task {i}" for i in range(count)], validation, 0.5).values())
+            splits = list(assign_splits([f"task {i}" for i in range(count)], validation, 0.5).values())
             assert {"train", "validation", "test"} == set(splits), (count, validation)
 
 
 def test_splits_depend_on_names_alone_and_have_their_sizes():
     names = [f"task {i}" for i in range(50)]
-    first, again = split_tasks(names, 0.1, 0.2), split_tasks(names[::-1], 0.1, 0.2)
+    first, again = assign_splits(names, 0.1, 0.2), assign_splits(names[::-1], 0.1, 0.2)
     assert first == again
     counts = {split: list(first.values()).count(split) for split in ("train", "validation", "test")}
     assert counts == {"train": 35, "validation": 5, "test": 10}
     assert list(first.values()) != sorted(first.values())
     for parts, message in (((-0.1, 0.1), "validation: got -0.1"), ((0.5, 0.5), r"validation \+ test: got 1.0")):
         with pytest.raises(ValueError, match=message):
-            split_tasks(names, *parts)
+            assign_splits(names, *parts)

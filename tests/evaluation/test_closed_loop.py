@@ -45,7 +45,7 @@ def test_a_result_counts_trials_by_every_criterion_and_has_floors_beside_each():
     env = types.SimpleNamespace(vision=True, criterion="exactly", target_kind=lambda task: task)
     trials = closed_loop.Trials(table, {"nearly": ~table | table}, ())
     misled = closed_loop.Trials(~table, {"nearly": table}, ())
-    found = closed_loop.describe(env, tiny_config(), jnp.array([-1, -1]), trials, misled, floors)
+    found = closed_loop.summarize(env, tiny_config(), jnp.array([-1, -1]), trials, misled, floors)
     assert (found["trials"], found["success"]) == (6, 0.5)
     assert found["baselines"] == {"random": 0.1, "other_demo": 0.5}
     assert found["wilson95"] == list(intervals.wilson_interval(3, 6))

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from milx.networks.attention import AttentiveActor, ObjectTokens, split_objects
+from milx.networks.attention import AttentiveActor, ObjectTokens, separate_objects
 from milx.networks.encoders import ContextConfig
 
 STATE, ACTION, STEPS, BATCH = 7, 2, 5, 4
@@ -34,7 +34,7 @@ def demo(rng):
 
 
 def test_states_are_split_into_objects_and_the_rest():
-    places, rest = split_objects(jnp.arange(2 * STATE).reshape(2, STATE), OBJECTS)
+    places, rest = separate_objects(jnp.arange(2 * STATE).reshape(2, STATE), OBJECTS)
     np.testing.assert_array_equal(places[1], [[8, 9], [12, 13], [10, 11]])
     np.testing.assert_array_equal(rest, [[0], [7]])
 

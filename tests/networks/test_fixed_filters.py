@@ -32,7 +32,7 @@ def write(path, weight=WEIGHT, **more):
 @pytest.mark.parametrize("kind", ["npz", "safetensors"])
 def test_vggs_layer_sees_the_normalised_image(kind, tmp_path):
     """SciPy's correlation of the image as VGG-19 wants it, away from the border."""
-    filters = fixed_filters.load(write(tmp_path / f"vgg.{kind}", other=np.zeros(2)), CONFIG)
+    filters = fixed_filters.read_filters(write(tmp_path / f"vgg.{kind}", other=np.zeros(2)), CONFIG)
     image = RNG.uniform(size=(12, 14, 3))
     normal = (image - fixed_filters.MEAN) / fixed_filters.STD
     for i in range(6):
@@ -51,10 +51,10 @@ def test_files_that_hold_something_else_are_refused(tmp_path):
         (write(tmp_path / "wide.npz", WEIGHT[:4]), r"features.0.weight: got \(4, 3, 3, 3\), expected \(6, 3, 3, 3\)"),
     ):
         with pytest.raises(ValueError, match=message):
-            fixed_filters.load(path, CONFIG)
+            fixed_filters.read_filters(path, CONFIG)
     np.savez(tmp_path / "other.npz", weight=WEIGHT)
     with pytest.raises(ValueError, match=r"features.0.weight: missing, .* there are weight"):
-        fixed_filters.load(str(tmp_path / "other.npz"), CONFIG)
+        fixed_filters.read_filters(str(tmp_path / "other.npz"), CONFIG)
 
 
 def scene(seed):
