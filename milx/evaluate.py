@@ -11,6 +11,7 @@ import sys
 from absl import app, flags, logging
 
 from milx.config import assemble
+from milx.config.registry import load_plugins
 from milx.core import platform
 from milx.training.factory import make_run
 
@@ -23,6 +24,7 @@ def main(argv: list[str]) -> None:
         raise app.UsageError(f"unexpected argument {argv[1]!r}")
     logging.set_verbosity(logging.WARNING)
     platform.configure()
+    load_plugins()
     path = pathlib.Path(_WORKDIR.value) / "config.json"
     if not path.is_file():
         sys.exit(f"milx: workdir: {path.parent} has no config.json, expected a folder of `python -m milx.train`")
