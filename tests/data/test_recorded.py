@@ -6,7 +6,7 @@ import pytest
 
 from milx.data import recorded as recorded_lib
 from milx.data.dataset import DataSet, Writer, spread
-from milx.data.recorded import Shards, load, sample_batch
+from milx.data.recorded import Shards, read_demos, sample_batch
 from milx.types import Demo
 
 HORIZON = 6
@@ -34,7 +34,7 @@ def data(tmp_path_factory):
 
 
 def whole(data):
-    return load(data, range(4), [range(count) for count in DEMOS], HORIZON)
+    return read_demos(data, range(4), [range(count) for count in DEMOS], HORIZON)
 
 
 def test_loaded_demonstrations_are_resampled_and_the_rest_is_marked(data):
@@ -78,14 +78,14 @@ def test_a_set_that_fits_is_one_shard(data):
     assert shards.whole
     first, later = shards.at(0), shards.at(7)
     assert first is later
-    expected = load(data, [0, 1, 3], [range(DEMOS[n]) for n in (0, 1, 3)], HORIZON)
+    expected = read_demos(data, [0, 1, 3], [range(DEMOS[n]) for n in (0, 1, 3)], HORIZON)
     jax.tree.map(np.testing.assert_array_equal, first, expected)
     jax.tree.map(lambda a, b: (a.shape, a.dtype) == (b.shape, b.dtype) or pytest.fail(), first, shards.shapes)
 
 
 def test_larger_sets_pass_by_in_shards_that_the_scan_determines(data, monkeypatch):
     monkeypatch.setattr(recorded_lib, "MOST_DEMOS", 2)
-    size = sum(x.nbytes for x in jax.tree.leaves(load(data, [0], [[0, 1]], HORIZON)))
+    size = sum(x.nbytes for x in jax.tree.leaves(read_demos(data, [0], [[0, 1]], HORIZON)))
     shards = Shards(data, [0, 1, 3], HORIZON, 2.5 * size / 2**30, seed=3, acting=2)
     assert (shards.num_tasks, shards.num_demos, shards.whole) == (2, 2, False)
     seen = []
