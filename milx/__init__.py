@@ -1,6 +1,7 @@
 """milx: one-shot visual imitation by meta-learning, end to end on the accelerator.
 
-Importing it changes nothing in the process; launchers call `configure` first, and so should scripts of your own.
+Importing milx does not change JAX's settings. The launchers call `configure` first, and your own scripts should do the
+same.
 """
 
 import importlib
@@ -31,7 +32,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> ModuleType:
-    """`milx.gym`, which needs Gymnasium, is imported when it is first used."""
+    """Imports `milx.gym`, which needs Gymnasium, when it is first used."""
     if name == "gym":
         return importlib.import_module("milx.gym")
     raise AttributeError(f"module 'milx' has no attribute {name!r}")

@@ -1,8 +1,9 @@
-"""Plans expert demonstrations and writes them, a file for each split.
+"""Plans expert demonstrations and writes them to one file for each split.
 
     python -m milx.collect --env=reach --workdir=demos --config.data.tasks=100
 
-A file holds states, actions and tasks; `milx.core.pytrees.load` reads it.
+Each file holds the tasks, the states, the actions and whether each demonstration succeeds; `milx.core.pytrees.load`
+reads it.
 """
 
 import pathlib

@@ -1,8 +1,8 @@
-"""Evaluates a run's best checkpoint again, on held-out tasks, with floors and ceiling.
+"""Evaluates a run's best checkpoint again on held-out tasks, beside the baselines and the upper bound.
 
     python -m milx.evaluate --workdir=runs/reach-mil-fast-0
 
-rewrites evaluation.json, the plot and the video in the run's folder.
+This command writes evaluation.json and the plot in the run's folder anew, and the video if the run is in simulation.
 """
 
 import pathlib

@@ -1,4 +1,4 @@
-"""Writes a run's best policy as two programs that run with JAX alone, on CPU and CUDA (`milx.deploy.export`).
+"""Writes a run's best policy as two programs that run without milx, on CPU and CUDA (`milx.deploy.export`).
 
 python -m milx.export runs/reach-mil-fast-0 exported
 """
@@ -26,9 +26,9 @@ def main(argv: list[str]) -> None:
     except (ValueError, OSError) as error:
         sys.exit(f"milx: {error}")
     size = sum(path.stat().st_size for path in pathlib.Path(argv[2]).iterdir())
-    print(f"{argv[2]}: {size / 1e6:.1f} MB; `from policy import Policy` there")
+    print(f"{argv[2]}: {size / 1e6:.1f} MB. To load it, use `from policy import Policy` in that folder.")
 
 
 if __name__ == "__main__":
-    flags.DEFINE_integer("shots", 1, "Demonstrations that the exported policy adapts to.", lower_bound=1)
+    flags.DEFINE_integer("shots", 1, "Number of demonstrations that the exported policy adapts to.", lower_bound=1)
     app.run(main)

@@ -1,11 +1,11 @@
-"""milx's environments in Gymnasium's interface, one at a time.
+"""milx's environments with Gymnasium's interface, one world at a time.
 
     env = milx.gym.GymEnv("reach", split="test")
     observation, info = env.reset(seed=0)
-    demo = env.demonstrate()  # of the same task, in another scene: what a policy adapts to
+    demo = env.demonstrate()  # the same task in another scene: a policy adapts to this
     observation, reward, terminated, truncated, info = env.step(action)
 
-For thousands of episodes at once use the environment itself (`milx.make`), under `jax.vmap`.
+To run thousands of episodes at once, use the environment itself (`milx.make`) under `jax.vmap`.
 """
 
 from typing import Any, SupportsFloat
@@ -29,14 +29,14 @@ from milx.types import SPLITS, Demo
 class GymEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
     """An environment of milx. An episode never terminates; it is truncated at the environment's horizon.
 
-    Observations are dictionaries of "state" float32 [S] and, where policies see pixels, "image" uint8 [H, W, 3]. The
-    reward of a step is minus the experts' running cost. After the last step `info["is_success"]` tells whether the
+    Observations are dictionaries with "state", float32 [S], and, if policies see pixels, "image", uint8 [H, W, 3]. The
+    reward of a step is minus the experts' running cost. After the last step, `info["is_success"]` says whether the
     episode succeeded.
 
     Args:
         name: a key of `milx.ENVS`.
-        split: whose tasks are drawn: "train", "validation" or "test".
-        image_shape: (H, W) in pixels; the published experiment's if None.
+        split: the split that tasks are sampled from: "train", "validation" or "test".
+        image_shape: (H, W) in pixels; None for that of the published experiment.
         render_mode: "rgb_array" or None.
 
     Raises:
@@ -73,7 +73,7 @@ class GymEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Draws a task and a scene; with options={"same_task": True} only a scene."""
+        """Samples a task and a scene; with options={"same_task": True}, keeps the task and samples only a scene."""
         super().reset(seed=seed)
         if self._task is None or not (options or {}).get("same_task", False):
             self._task = self._draw(self._key())
@@ -81,7 +81,7 @@ class GymEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         return self._observe(), {}
 
     def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], SupportsFloat, bool, bool, dict[str, Any]]:
-        """Acts for one time step."""
+        """Applies the action for one time step."""
         t, state, chosen = len(self._states) - 1, self._states[-1], jnp.asarray(action, jnp.float32)
         cost = self._cost(self._task, state, chosen, jnp.asarray(t))
         self._states.append(self.env.step(self._task, state, chosen))
@@ -92,14 +92,17 @@ class GymEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         return self._observe(), -float(cost), False, truncated, info
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
-        """[H, W, 3] uint8, what the camera sees."""
+        """Returns the camera's image, [H, W, 3] uint8; None if `render_mode` is None."""
         return None if self.render_mode is None else np.asarray(self._render(self._task, self._states[-1]))
 
     def demonstrate(self, config: DataConfig | None = None) -> Demo:
-        """An expert's demonstration of the current task in another scene: [T, ...], NumPy.
+        """Demonstrates the current task in another scene with an expert.
 
         Args:
-            config: how to plan; that of the preset `fast` if None.
+            config: settings of the expert; None for those of the preset `fast`.
+
+        Returns:
+            A demonstration [T, ...] of NumPy arrays.
         """
         config = config or make_config(self.env.name, preset="fast").data
         scene = self._reset(self._key(), self._task)

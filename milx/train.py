@@ -1,6 +1,6 @@
-"""Plans demonstrations, meta-trains, evaluates: from nothing to a one-shot policy.
+"""Plans or reads demonstrations, meta-trains a policy on them, and evaluates it on held-out tasks.
 
-Run it again with the same flags and it continues where it stopped.
+A run that is started again with the same flags continues where it stopped.
 
     python -m milx.train --env=reach
     python -m milx.train --env=reach --preset=paper --seed=1 --config.train.meta_batch=25
@@ -12,7 +12,7 @@ from milx.training.factory import make_run
 
 
 def main(config: Config, workdir: str) -> None:
-    """Trains and evaluates."""
+    """Meta-trains the policy and evaluates it."""
     run = make_run(config, workdir)
     run.train()
     run.report(run.evaluate())

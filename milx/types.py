@@ -1,7 +1,7 @@
-"""The records that flow through milx, their shapes said once.
+"""The data structures that milx's modules exchange, with their shapes.
 
 Letters used in shapes throughout the project:
-    `N` tasks, `K` demonstrations of a task (shots), `T` time steps, `H`, `W` image height and width,
+    `N` tasks, `K` demonstrations of a task (shots), `T` time steps, `H` and `W` image height and width,
     `S` size of the robot's state, `A` size of an action, `G` size of a goal, `O` objects.
 """
 
@@ -11,30 +11,30 @@ from typing import Any
 import jax
 
 Array = Any
-"""A `jax.Array`; at milx's doors also a NumPy array, and inside `jax.eval_shape` a `jax.ShapeDtypeStruct`."""
+"""A `jax.Array`. Public functions also accept NumPy arrays. Inside `jax.eval_shape` it is a `jax.ShapeDtypeStruct`."""
 
 Params = Any
-"""A pytree of arrays: what a method learns, or what it has adapted to one task."""
+"""A pytree of arrays: the parameters that a method learns, or those that it has adapted to one task."""
 
 Memory = Any
-"""A pytree of arrays that a policy carries from one time step to the next; `()` if it carries none."""
+"""A pytree of arrays that a policy passes from one time step to the next; `()` for a policy without memory."""
 
 
 SPLITS = ("train", "validation", "test")
-"""Tasks to learn from, to choose the best checkpoint by, and to report the result on."""
+"""Tasks for meta-training, tasks for selecting the best checkpoint, and tasks for the reported result."""
 
 SPEC_FILE = "spec.json"
-"""In the folder of a run on recorded demonstrations: its `Spec`, which an environment tells otherwise."""
+"""The file with the `Spec` of a run on recorded demonstrations. In other runs the environment provides the `Spec`."""
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Observation:
-    """What a policy sees at one time step (any leading axes may stand in front).
+    """What a policy observes at one time step. All fields may have the same leading axes in front.
 
     Attributes:
-        image: [H, W, 3] uint8, RGB; None where the policy sees no pixels.
-        state: [S] float32, the robot's own state in its natural units, and the objects' where there is no image.
+        image: [H, W, 3] uint8, RGB; None if the policy sees no pixels.
+        state: [S] float32, the robot's state in its natural units; without an image it includes the objects' state.
     """
 
     image: Array = None
@@ -47,11 +47,11 @@ class Demo:
     """One demonstration, or several with leading axes such as `[N, K]`.
 
     Attributes:
-        image: [T, H, W, 3] uint8, RGB; None where policies see no pixels.
+        image: [T, H, W, 3] uint8, RGB; None if the policy sees no pixels.
         state: [T, S] float32; None when the demonstration has no states.
         action: [T, A] float32; None when the demonstration has no actions.
-        goal: [T, G] float32, where the robot was heading (`milx.data.goals`), in the units of the state; NaN where
-            unknown, None if it is everywhere.
+        goal: [T, G] float32, where the robot was heading (`milx.data.goals`), in the units of the state; NaN at time
+            steps where it is unknown, None if it is unknown at all of them.
     """
 
     image: Array = None
@@ -63,12 +63,12 @@ class Demo:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class TaskBatch:
-    """A meta-batch: what every task is learnt from, and what the adapted policy must then imitate.
+    """A meta-batch: demonstrations to adapt to, and demonstrations that the adapted policy must imitate.
 
     Attributes:
-        support: demonstrations with axes [N, K, T, ...].
-        query: other demonstrations of the same tasks, with axes [N, Q, T, ...].
-        task: [N] int32, their numbers in the training set; None if they are from nowhere.
+        support: demonstrations to adapt to, with axes [N, K, T, ...].
+        query: other demonstrations of the same tasks, to imitate, with axes [N, Q, T, ...].
+        task: [N] int32, the tasks' indices in the training set; None if the tasks do not come from one.
     """
 
     support: Demo
@@ -78,18 +78,20 @@ class TaskBatch:
 
 @dataclasses.dataclass(frozen=True)
 class Spec:
-    """The sizes of what a policy sees and does.
+    """The sizes of a policy's observations and actions, and the meaning of some entries of the state.
 
     Attributes:
-        image_shape: (H, W); None where the policy sees no pixels.
+        image_shape: (H, W); None if the policy sees no pixels.
         state_size: S.
         action_size: A.
-        action_range: lowest and highest entry of each action; None without limits.
-        goal_indices: entries of the state that tell where the robot is heading (`milx.data.goals`).
-        image_to_goal: [3][G] affine map from (x, y, 1), x and y in [-1, 1] across and down the image, to those entries,
-            from the camera's calibration; None if that is not known.
-        object_indices: [O][2] entries of the state with each object's place, where the state tells them.
-        height_index: entry of the state that tells how high the hand is, where it must come down to an object.
+        action_range: minimum and maximum of each entry of the action; None if actions have no limits.
+        goal_indices: indices of the G entries of the state from which goals are read (`milx.data.goals`).
+        image_to_goal: [3][G] affine map from (x, y, 1), with x and y in [-1, 1] across and down the image, to those
+            entries. It comes from the camera's calibration; None if that is unknown.
+        object_indices: [O][2] indices of the entries of the state that hold each object's position, if the state
+            contains them.
+        height_index: index of the entry of the state that holds the height of the hand, in environments where the hand
+            must come down to an object; None otherwise.
     """
 
     image_shape: tuple[int, int] | None
@@ -102,12 +104,12 @@ class Spec:
     height_index: int | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON can hold it."""
+        """Returns the fields as a dictionary that can be written as JSON."""
         return dataclasses.asdict(self)
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> "Spec":
-        """The inverse of `to_dict`, also after a trip through JSON."""
+        """Builds a `Spec` from the result of `to_dict`, which may have been written to JSON and read back."""
         return cls(**{name: _as_tuple(value) for name, value in values.items()})
 
 

@@ -1,1 +1,1 @@
-"""Configurations: what they hold, which values they may have, and the presets."""
+"""Configurations: their fields, the values that the fields may have, and the presets."""

@@ -1,9 +1,9 @@
-"""Puts configurations together: from presets, from JSON, and from values of single fields.
+"""Builds configurations from presets, from JSON, and from values of single fields.
 
     config = make_config("reach", preset="paper")
 
-A preset is what an environment changes of the defaults (`milx.config.registry`). Fields that the method does not have
-are left out of it; anywhere else they are an error.
+A preset holds the values in which an environment differs from the defaults (`milx.config.registry`). A preset may set
+fields that the method does not have; they are ignored. Anywhere else such a field is an error.
 """
 
 import dataclasses
@@ -20,7 +20,7 @@ from milx.config.schema import Config
 
 
 def make_config(env: str, method: str = "mil", preset: str = "fast", seed: int = 0) -> Config:
-    """The configuration of a preset.
+    """Builds the configuration of a preset.
 
     Raises:
         ValueError: for an environment, method or preset that does not exist; the message lists those that do.
@@ -39,7 +39,7 @@ def make_config(env: str, method: str = "mil", preset: str = "fast", seed: int =
 
 
 def default_config(method: str) -> Config:
-    """What every preset of a method begins with.
+    """Builds the configuration that every preset of a method starts from.
 
     Raises:
         ValueError: for a method that does not exist; the message lists those that do.
@@ -51,21 +51,23 @@ def default_config(method: str) -> Config:
 
 
 def overrides(config: Config) -> dict[str, Any]:
-    """The fields, by dotted name, in which a configuration differs from its preset."""
+    """Returns the fields, by dotted name, in which a configuration differs from its preset."""
     before = fields(make_config(config.env_name, config.method_name, config.preset, config.seed))
     return {name: value for name, value in fields(config).items() if value != before[name]}
 
 
 def to_dict(config: Config) -> dict[str, Any]:
-    """The configuration as nested dictionaries that JSON can hold, with the version of their layout."""
+    """Returns the configuration as nested dictionaries for JSON, with the version of their layout."""
     return {"config_version": VERSION, **dataclasses.asdict(config)}
 
 
 def from_dict(values: dict[str, Any]) -> Config:
-    """The inverse of `to_dict`, also after a trip through JSON, and of any earlier layout. What lacks has its default.
+    """Builds a configuration from the result of `to_dict`, which may have been written to JSON and read back.
+
+    Earlier layouts are understood, too. Fields that are missing have their defaults.
 
     Raises:
-        ValueError: for a field that does not exist (the message lists those that do), or has a value that it cannot.
+        ValueError: for a field that does not exist (the message lists those that do), or a value that is not allowed.
     """
     if not isinstance(values, dict):
         raise ValueError(f"config: got {values!r}, expected a group of fields")
@@ -77,10 +79,10 @@ def from_dict(values: dict[str, Any]) -> Config:
 
 
 def read(path: pathlib.Path) -> Config:
-    """The configuration in a JSON file.
+    """Reads the configuration in a JSON file.
 
     Raises:
-        ValueError: if it holds none; the message names the file.
+        ValueError: if the file holds no valid configuration; the message names the file.
     """
     try:
         return from_dict(json.loads(path.read_text()))
@@ -89,12 +91,12 @@ def read(path: pathlib.Path) -> Config:
 
 
 def fields(config: Config) -> dict[str, Any]:
-    """The values of all fields, by dotted name."""
+    """Returns the values of all fields, by dotted name."""
     return flatten(dataclasses.asdict(config))
 
 
 def flatten(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested dictionaries as one, with dotted names."""
+    """Flattens nested dictionaries to a single one with dotted names."""
     flat: dict[str, Any] = {}
     for name, value in values.items():
         flat |= flatten(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
@@ -102,7 +104,7 @@ def flatten(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
-    """Where two configurations of `to_dict` differ, a line each."""
+    """Compares two results of `to_dict`; returns one line of text for each field that differs."""
     before, after = flatten(old), flatten(new)
     names = [*before, *(name for name in after if name not in before)]
     changed = [name for name in names if before.get(name, "not there") != after.get(name, "not there")]
@@ -113,7 +115,7 @@ def assign(config: Config, field: str, value: Any) -> None:
     """Sets the field with this dotted name.
 
     Raises:
-        ValueError: if there is no such field, or the value is None and the field cannot be.
+        ValueError: if there is no such field, or if the value is None and the field must have a value.
     """
     if field not in fields(config):
         raise ValueError(f"config.{field}: no such field with method {config.method_name!r}")
@@ -125,7 +127,7 @@ def assign(config: Config, field: str, value: Any) -> None:
 
 
 def _fill(group: Any, values: Any, path: str) -> None:
-    """Sets the fields of a group, and of the groups in it, to values as JSON has them."""
+    """Sets the fields of a group, and of the groups inside it, to values read from JSON."""
     known = [field.name for field in dataclasses.fields(group)]
     if not isinstance(values, dict) or not all(isinstance(name, str) for name in values):
         raise ValueError(f"{path}: got {values!r}, expected a group of fields")

@@ -1,4 +1,4 @@
-"""Checks of a configuration's values: their types, and that they lie where they mean something."""
+"""Checks of a configuration's values: their types and their ranges."""
 
 import dataclasses
 import math
@@ -10,7 +10,7 @@ from typing import Any
 from milx.config.schema import Config
 
 MOST = 10**9
-"""Counts end here."""
+"""The maximum of every integer field, even where the field itself allows more."""
 _LARGEST = 1e30
 
 
@@ -18,7 +18,7 @@ def check_config(config: Config) -> None:
     """Checks every field of a configuration.
 
     Raises:
-        ValueError: naming the field, its value and what was expected.
+        ValueError: if a value is not allowed; the message names the field, its value and what was expected.
     """
     _check_group(config, "")
     network = config.network

@@ -1,7 +1,7 @@
-"""Configurations of earlier layouts, as they stand in result files and beside policies.
+"""Conversion of configurations with an earlier layout, as result files and stored policies contain them.
 
-Version 1 had no number. All methods shared one class of networks and one group "mil"; a field that a method did not
-read stood there all the same.
+Version 1 had no version number. All methods shared one class of network settings and one group "mil", so a
+configuration also held fields that its method did not use.
 """
 
 from typing import Any
@@ -18,14 +18,14 @@ _NETWORK: dict[Any, tuple[str, ...]] = {
     "lstm": ("context", "context_frames"),
     "lstm_attention": ("context",),
 }
-"""What the networks of a method have that others do not."""
+"""By method: the fields of its networks' settings that not all methods have."""
 
 
 def migrate(values: dict[str, Any]) -> dict[str, Any]:
-    """The values of a configuration in today's layout, without their version.
+    """Converts the values of a configuration to the current layout and removes their version.
 
     Raises:
-        ValueError: for a version that is not known.
+        ValueError: for an unknown version.
     """
     version = values.get("config_version", 1)
     if version not in (1, VERSION):
@@ -37,9 +37,9 @@ def migrate(values: dict[str, Any]) -> dict[str, Any]:
 def _from_version_1(values: dict[str, Any]) -> dict[str, Any]:
     groups = {name: values.get(name, {}) for name in ("mil", "network", "train")}
     if not all(isinstance(group, dict) for group in groups.values()):
-        return values  # which is refused for what it is
+        return values  # the caller rejects a group that is not a dictionary
     method_name, (mil, network, train) = values.get("method_name", "mil"), map(dict, groups.values())
-    if "redraw_appearance" in train:  # its first name
+    if "redraw_appearance" in train:  # the field's earlier name
         train["redraw"] = train.pop("redraw_appearance")
     steps = {"imitation_steps": train.pop("imitation_steps")} if "imitation_steps" in train else {}
     method = mil | steps if method_name == "mil" else {name: mil[name] for name in _OF_ALL if name in mil}

@@ -1,4 +1,4 @@
-"""What presets of several environments share."""
+"""Settings that the presets of several environments share."""
 
 from milx.config.registry import Overrides
 
@@ -8,7 +8,7 @@ CONDITIONED: Overrides = {
     "optimizer.cosine": True,
     "optimizer.clip_norm": 1.0,
 }
-"""A meta-optimiser with a warm-up, a cosine and a bounded gradient."""
+"""Settings of the meta-optimizer: a warm-up, a cosine decay and a bound on the norm of the meta-gradient."""
 
 GOAL_HEAD: Overrides = {
     "network.goal_head": True,
@@ -17,7 +17,7 @@ GOAL_HEAD: Overrides = {
     "method.learn_inner_lr": True,
     "method.whiten_actions": True,
 }
-"""milx's goal head, and the inner step that learns with it."""
+"""milx's goal head, and the settings of the loss and of the inner step that it is used with."""
 
 WITHOUT_PIXELS: Overrides = {
     "network.filters": (),
@@ -27,4 +27,4 @@ WITHOUT_PIXELS: Overrides = {
     "train.support_frames": None,
     "train.query_frames": None,
 }
-"""No convolutions, but all time steps, which cost little then."""
+"""No convolutions. All time steps are used, because they cost little without images."""

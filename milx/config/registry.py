@@ -1,7 +1,7 @@
 """Environments, methods and presets by name: milx's own, and those that other packages register.
 
-A package of yours registers what it has when it is imported. Launchers import all packages that name themselves in the
-entry-point group "milx.plugins":
+Your package registers its environments and methods when it is imported. The launchers import every package that has an
+entry point in the group "milx.plugins":
 
     [project.entry-points."milx.plugins"]
     mine = "my_package"
@@ -15,7 +15,7 @@ from milx.config.schema import Config, MethodConfig, NetworkConfig
 from milx.types import Spec
 
 PLUGINS = "milx.plugins"
-"""The entry-point group."""
+"""The entry-point group of packages that extend milx."""
 
 Overrides = dict[str, Any]
 """Values of a configuration's fields, by dotted name."""
@@ -25,10 +25,10 @@ class MethodEntry(NamedTuple):
     """A registered method.
 
     Attributes:
-        make: builds it from a configuration and the sizes of what it sees and does.
+        make: builds the method from a configuration and the sizes of observations and actions.
         network: the class of `Config.network`.
         method: the class of `Config.method`.
-        overrides: what it changes of every preset.
+        overrides: values that replace those of every preset.
     """
 
     make: Callable[[Config, Spec], Any]
@@ -38,31 +38,33 @@ class MethodEntry(NamedTuple):
 
 
 ENVS: dict[str, Any] = {}
-"""Classes of environments, called with an image shape (H, W) or None."""
+"""Classes of environments by name. They are called with an image shape (H, W) or None."""
 METHODS: dict[str, MethodEntry] = {}
 PRESETS: dict[str, dict[str, Overrides]] = {}
-"""By environment and name: what a preset changes of the defaults. Fields that a method does not have are left out."""
+"""Presets by environment and name: the values in which they differ from the defaults.
+
+Fields that a method does not have are ignored."""
 
 
 def register_env(env: Any, presets: dict[str, Overrides]) -> None:
-    """Makes an environment known to `milx.make` and to `--env`.
+    """Makes an environment available to `milx.make` and `--env`.
 
     Args:
-        env: a subclass of `milx.envs.base.Env`; its attribute `name` is its name.
-        presets: by name; "fast" and "cpu" are what launchers take with and without an accelerator.
+        env: a subclass of `milx.envs.base.Env`; it is registered under its attribute `name`.
+        presets: by name. Launchers use "fast" by default with an accelerator, and "cpu" without one.
 
     Raises:
-        ValueError: for a name that is taken.
+        ValueError: if the name is already registered.
     """
     _add(ENVS, "env", env.name, env)
     register_presets(env.name, presets)
 
 
 def register_presets(env: str, presets: dict[str, Overrides]) -> None:
-    """Makes the presets of an environment known.
+    """Registers the presets of an environment.
 
     Raises:
-        ValueError: for an environment that has presets.
+        ValueError: if the environment already has presets.
     """
     _add(PRESETS, "presets", env, presets)
 
@@ -74,23 +76,23 @@ def register_method(
     method: type[MethodConfig] = MethodConfig,
     overrides: Overrides | None = None,
 ) -> None:
-    """Makes a method known to `--method`.
+    """Makes a method available to `--method`.
 
     Args:
-        name: what it is called.
-        make: builds a `milx.methods.base.Method` from a configuration and the sizes of what it sees and does.
+        name: the method's name.
+        make: builds a `milx.methods.base.Method` from a configuration and the sizes of observations and actions.
         network: the class of its networks' settings.
         method: the class of its own settings.
-        overrides: what it changes of every preset.
+        overrides: values that replace those of every preset.
 
     Raises:
-        ValueError: for a name that is taken.
+        ValueError: if the name is already registered.
     """
     _add(METHODS, "method", name, MethodEntry(make, network, method, overrides or {}))
 
 
 def load_plugins() -> None:
-    """Imports the packages that have an entry point in PLUGINS."""
+    """Imports the packages that have an entry point in the group PLUGINS."""
     for plugin in importlib.metadata.entry_points(group=PLUGINS):
         plugin.load()
 

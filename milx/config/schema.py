@@ -1,8 +1,8 @@
-"""Every hyperparameter, as plain dataclasses; fields say the least and the greatest number that they may hold.
+"""All hyperparameters, as plain dataclasses. Each field defines the minimum and the maximum of its numbers.
 
-Two groups depend on the method: `Config.network` and `Config.method` are the classes that it was registered with
-(`milx.config.registry`), which extend `NetworkConfig` and `MethodConfig`. A launcher's `--config.path.to.field=value`
-overrides one field.
+Two groups depend on the method: `Config.network` and `Config.method` are instances of the classes that the method was
+registered with (`milx.config.registry`). These classes extend `NetworkConfig` and `MethodConfig`. The launchers' flag
+`--config.path.to.field=value` overrides one field.
 """
 
 import dataclasses
@@ -10,24 +10,28 @@ import math
 from typing import Any
 
 GIVEN = ("video+state+action", "video+state", "video")
-"""What a demonstration can show of a new task."""
+"""The parts of a demonstration of a new task that a policy may be shown."""
 LARGEST_SIZE = 1 << 14
-"""Of a layer, or of a side of an image: more is a slip of the finger."""
+"""Maximum size of a layer. A larger value is most likely a typing error."""
 
 
 def number(default: Any, low: float = 1, high: float = math.inf) -> Any:
-    """A field of numbers, or of a tuple of them, that lie between `low` and `high`; other fields are counts, from 1."""
+    """Defines a field whose number, or tuple of numbers, must be at least `low` and at most `high`.
+
+    The numbers of all other fields must be at least 1.
+    """
     return dataclasses.field(default=default, metadata={"low": low, "high": high})
 
 
 @dataclasses.dataclass
 class EnvConfig:
-    """The world.
+    """The environment.
 
     Attributes:
         image_shape: (H, W) of the policy's image in pixels.
-        action_cost: weight of the actions among the residuals whose squares the planner sums: with a lower one the
-            expert moves at once and fast, and its first actions tell where it goes; None for the environment's own.
+        action_cost: weight of the actions among the residuals whose squares the planner sums. With a lower weight the
+            expert starts at once and moves fast, so its first actions show where it goes. None for the environment's
+            own weight.
     """
 
     image_shape: tuple[int, int] = number((64, 80), 1, 4096)
@@ -39,12 +43,12 @@ class DataConfig:
     """Expert demonstrations.
 
     Attributes:
-        tasks: training tasks.
-        demos_per_task: demonstrations of each, in different scenes.
+        tasks: number of training tasks.
+        demos_per_task: demonstrations of each training task, in different scenes.
         noise: standard deviation of the Gaussian noise on the expert's actions, in units of the action.
-        spare_demos: demonstrations of validation and test tasks beyond those that are shown, in place of failed ones.
-        plan_iterations: most iterations of trajectory optimisation for a demonstration; 0 for the environment's
-            controller instead.
+        spare_demos: additional demonstrations of each validation and test task, so that failed ones can be replaced.
+        plan_iterations: maximum number of iterations of trajectory optimization for a demonstration; 0 to use the
+            environment's controller instead.
         plan_batch: demonstrations planned at once.
     """
 
@@ -58,13 +62,15 @@ class DataConfig:
 
 @dataclasses.dataclass
 class RecordedConfig:
-    """Recorded demonstrations, instead of an environment (`milx.data.dataset`).
+    """Recorded demonstrations, which replace an environment (`milx.data.dataset`).
 
     Attributes:
         path: the data set's folder.
-        horizon: time steps that every demonstration is resampled to.
-        goal_indices: entries of the state that tell where the robot is: a goal head predicts where they end.
-        gib: room on the device for what a scan draws its batches from, in GiB; the next scan's is loaded meanwhile.
+        horizon: number of time steps that every demonstration is resampled to.
+        goal_indices: indices of the entries of the state that hold the robot's position. A goal head predicts their
+            values at the end of the demonstration.
+        gib: device memory, in GiB, for the demonstrations from which one scan of meta-updates samples its batches.
+            While a scan runs, the next scan's demonstrations are loaded, which can take as much memory again.
     """
 
     path: str = ""
@@ -75,24 +81,26 @@ class RecordedConfig:
 
 @dataclasses.dataclass
 class NetworkConfig:
-    """The networks of all methods: convolutions, then fully connected layers that also see the robot's state.
+    """The networks of all methods: convolutions, then fully connected layers that also receive the robot's state.
 
     Attributes:
         filters: output channels of each convolution.
         strides: stride of each convolution.
         kernel: height and width of every kernel.
-        fixed_filters: the first convolution is given and never learned: "kmeans" for a bank of the training images, or
-            a file with VGG-19's first layer (`milx.networks.fixed_filters`); None for one that is learned.
-        mixed_precision: convolve in bfloat16; parameters, norms and all other layers stay in float32.
-        rematerialise: keep only the inputs of each convolution for the backward pass and compute the rest a second
-            time: less memory, more time, the same results.
-        soft_argmax: spatial soft-argmax after the last convolution, with a learned temperature; flattened otherwise.
+        fixed_filters: source of a first convolution that is never trained: "kmeans" for clusters of patches of the
+            training images, or a file with VGG-19's first layer (`milx.networks.fixed_filters`). None for a learned
+            first convolution.
+        mixed_precision: compute convolutions in bfloat16; parameters, norms and all other layers stay in float32.
+        rematerialise: keep only the input of each convolution for the backward pass and compute the rest a second time.
+            This takes less memory and more time; the results are the same.
+        soft_argmax: apply a spatial soft-argmax with a learned temperature after the last convolution; otherwise its
+            output is flattened.
         fc_layers: sizes of the hidden fully connected layers.
-        fc_norm: layer norm in the hidden fully connected layers.
-        fc_init_std: standard deviation of their first weights; None for LeCun's initialisation.
-        goal_head: predict where the episode ends, from the image, or from the state where the policy sees no pixels,
-            and show the prediction to the layers after it (`milx.networks.goal`).
-        calibrate: start the goal head's votes from the camera's calibration, where it is known.
+        fc_norm: apply layer norm in the hidden fully connected layers.
+        fc_init_std: standard deviation of the initial weights of these layers; None for LeCun's initialization.
+        goal_head: predict the goal from the image, or from the state if the policy sees no pixels, and pass the
+            prediction on to the following layers (`milx.networks.goal`).
+        calibrate: initialize the goal head's votes from the camera's calibration, if it is known.
     """
 
     filters: tuple[int, ...] = number((40, 40, 40), 1, LARGEST_SIZE)
@@ -111,13 +119,14 @@ class NetworkConfig:
 
 @dataclasses.dataclass
 class MethodConfig:
-    """What holds for all methods.
+    """The settings that all methods have.
 
     Attributes:
-        loss_scale: m; errors of the actions are multiplied by it before they are squared.
-        whiten_actions: let the network predict actions with zero mean and unit variance.
+        loss_scale: factor by which the errors of the actions are multiplied before they are squared.
+        whiten_actions: let the network predict actions that are whitened to zero mean and unit variance.
         goal_weight: weight of the goal head's negative log likelihoods, or of the target head's squared error.
-        given: what a policy is shown of a new task: one of GIVEN. Queries, in meta-training, show everything.
+        given: the parts of a demonstration of a new task that the policy is shown, one of GIVEN. In meta-training,
+            query demonstrations always have all parts.
     """
 
     loss_scale: float = number(1.0, 0)
@@ -131,10 +140,10 @@ class OptimizerConfig:
     """Adam on the meta-objective.
 
     Attributes:
-        learning_rate: its peak.
-        warmup: fraction of the run that warms up linearly from zero.
-        cosine: decay to zero along a cosine over the run; constant otherwise.
-        clip_norm: bound on the global norm of the meta-gradient; None for none.
+        learning_rate: the maximum learning rate.
+        warmup: fraction of the meta-updates in which the learning rate rises linearly from zero.
+        cosine: let the learning rate decay to zero along a cosine over the rest of the run; otherwise it is constant.
+        clip_norm: bound on the global norm of the meta-gradient; None for no bound.
     """
 
     learning_rate: float = number(1e-3, 0)
@@ -148,15 +157,15 @@ class TrainConfig:
     """The meta-training loop.
 
     Attributes:
-        steps: meta-updates.
+        steps: number of meta-updates.
         meta_batch: tasks in a meta-batch.
         shots: support demonstrations of each task.
-        support_frames: time steps drawn from each support demonstration; None for all.
-        query_frames: time steps drawn from each query demonstration; None for all.
-        redraw: whenever a task is drawn, show it in new colours of the training split, and its demonstrations among
-            distractors in new places: few planned demonstrations stand for many tasks and scenes.
-        log_every: meta-updates in one scan on the device.
-        eval_every: meta-updates between two validations; each is followed by a checkpoint.
+        support_frames: time steps sampled from each support demonstration; None for all.
+        query_frames: time steps sampled from each query demonstration; None for all.
+        redraw: whenever a task is sampled, give it a new appearance of the training split, and give the distractors in
+            its demonstrations new positions. A few planned demonstrations then stand for many tasks and scenes.
+        log_every: meta-updates in one scan on the device; metrics are logged after every scan.
+        eval_every: meta-updates between two validations, each with a checkpoint.
     """
 
     steps: int = 30_000
@@ -174,10 +183,10 @@ class EvalConfig:
     """Closed-loop evaluation.
 
     Attributes:
-        validation_tasks: held-out tasks for choosing the best checkpoint.
-        tasks: held-out tasks of the reported number.
-        trials: scenes tried for each task.
-        baseline_trials: in how many of those scenes the experts and random actions are tried, too.
+        validation_tasks: held-out tasks for selecting the best checkpoint.
+        tasks: held-out tasks for the reported result (test tasks).
+        trials: scenes in which each task is tried.
+        baseline_trials: number of these scenes in which the experts and random actions are tried, too.
         shots: demonstrations that the policy adapts to.
         batch: tasks rolled out at once.
     """
@@ -192,7 +201,7 @@ class EvalConfig:
 
 @dataclasses.dataclass
 class Config:
-    """A whole run; `milx.config.assemble` puts it together."""
+    """The configuration of a run, built by `milx.config.assemble`."""
 
     env_name: str
     method_name: str

@@ -1,1 +1,1 @@
-"""What every layer above builds on: devices, batches, pytrees, checkpoints, small linear algebra."""
+"""The basis of all other packages: devices, batches, pytrees, checkpoints and small linear systems."""

@@ -1,4 +1,4 @@
-"""Mapping a function over more inputs than a device should work on at once: by calls, and inside a jitted one."""
+"""Mapping a function over more inputs than fit on a device at once: by several calls, or inside `jax.jit`."""
 
 from collections.abc import Callable
 from typing import Any
@@ -12,12 +12,13 @@ from milx.core import parallel
 def map_in_chunks(function: Callable[..., Any], inputs: tuple, size: int) -> Any:
     """Calls `function(*inputs)` on slices of the leading axis and joins the results.
 
-    Every call has the same size, so that one compilation serves all: where entries lack, the last one is repeated.
+    All calls have the same size, so the function is compiled only once. The last slice is filled up by repeating the
+    last entry.
 
     Args:
         function: maps pytrees with leading axis [size] to a pytree with leading axis [size].
         inputs: pytrees with leading axis [M].
-        size: the most entries of one call, but for rounding up to a multiple of the number of devices.
+        size: number of entries in one call. It is rounded up to a multiple of the number of devices.
 
     Returns:
         The results, with leading axis [M].
@@ -32,18 +33,23 @@ def map_in_chunks(function: Callable[..., Any], inputs: tuple, size: int) -> Any
 
 
 def map_in_groups(function: Callable[..., Any], inputs: tuple, most: int) -> Any:
-    """`jax.vmap(function)(*inputs)` in equal groups, one after the other; to be called inside `jax.jit`.
+    """Computes `jax.vmap(function)(*inputs)` in equal groups, one after the other, inside `jax.jit`.
 
     Args:
         function: maps pytrees to a pytree.
-        inputs: the same with a leading axis [N].
-        most: of the entries of a group. Groups are N's largest divisor up to it, so a prime number goes one by one.
+        inputs: the function's inputs, with a leading axis [N].
+        most: maximum size of a group. The size is the largest divisor of N that is at most `most`, so the groups have
+            size 1 if N is a prime number greater than `most`.
+
+    Returns:
+        The results, with leading axis [N].
     """
     total = len(jax.tree.leaves(inputs)[0])
     size = max(size for size in range(1, total + 1) if total % size == 0 and size <= max(most, 1))
     if size == total:
         return jax.vmap(function)(*inputs)
-    # By sizes that are said, as leaves without entries do not tell: jax.lax.map(batch_size=...) stumbles over them.
+    # All sizes are explicit, because they cannot be inferred for arrays without entries: jax.lax.map(batch_size=...)
+    # fails on such arrays.
     groups = jax.tree.map(lambda x: x.reshape(total // size, size, *x.shape[1:]), inputs)
     found = jax.lax.map(lambda group: jax.vmap(function)(*group), groups)
     return jax.tree.map(lambda x: x.reshape(total, *x.shape[2:]), found)

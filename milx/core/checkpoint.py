@@ -1,7 +1,7 @@
-"""Checkpoints through Orbax: the latest and the best kept, each with checksums of its files.
+"""Checkpoints, written with Orbax: the latest and the best are kept, each with checksums of its files.
 
-A checkpoint that is damaged is reported and the one before it is used. In a run that goes on it is moved aside, to
-`damaged/` beside the checkpoints, so that nothing is lost and its step can be written again.
+A damaged checkpoint is reported, and the one before it is used. When a run continues, its damaged checkpoints are moved
+to `damaged/` beside the folder of checkpoints. Nothing is lost, and checkpoints of the same steps can be written again.
 """
 
 import contextlib
@@ -24,7 +24,7 @@ from orbax.checkpoint import checkpoint_managers as policies
 from milx.core import parallel
 
 UNVALIDATED = -1e9
-"""The score of a checkpoint that nobody has validated: it is the best only where there is no other."""
+"""The score of a checkpoint that has not been validated: it is the best one only if there is no other."""
 _CHECKSUMS = "checksums.json"
 _METADATA = "_CHECKPOINT_METADATA"
 
@@ -37,9 +37,9 @@ class Checkpoints:
     """The checkpoints of a run.
 
     Args:
-        folder: where they lie; made if missing.
-        read_only: look only, never write.
-        report: told of what is damaged or could not be written.
+        folder: the folder of the checkpoints; created if missing, unless `read_only` is set.
+        read_only: only read checkpoints, and never write to the folder.
+        report: is called with a message about each checkpoint that is damaged or could not be written.
 
     Raises:
         ValueError: if there are checkpoints and all of them are damaged.
@@ -61,16 +61,19 @@ class Checkpoints:
         return self._manager.best_step()
 
     def save(self, step: int, items: dict[str, Any], score: float, extra: dict[str, Any]) -> bool:
-        """Writes pytrees of arrays; where it cannot, say on a full disk, it reports that and leaves the others alone.
+        """Writes pytrees of arrays as a checkpoint.
+
+        If it cannot be written, for example because the disk is full, this is reported, and the other checkpoints are
+        left as they are.
 
         Args:
-            step: meta-updates done.
+            step: number of meta-updates done.
             items: pytrees by name; each can be restored alone.
-            score: of the validation, by which the best checkpoint is chosen, or UNVALIDATED.
-            extra: numbers to restore beside the arrays, as JSON.
+            score: the validation's score, by which the best checkpoint is selected, or UNVALIDATED.
+            extra: values to store as JSON beside the arrays.
 
         Returns:
-            Whether it is written.
+            Whether the checkpoint was written.
         """
         saves = {name: ocp.args.StandardSave(jax.tree.map(_stored, tree)) for name, tree in items.items()}
         args = ocp.args.Composite(**saves, extra=ocp.args.JsonSave(extra))
@@ -79,7 +82,7 @@ class Checkpoints:
             self._manager.wait_until_finished()
             if parallel.is_first_host():
                 _write_checksums(self.folder / str(step))
-        except Exception as error:  # from threads of several libraries, with types of their own
+        except Exception as error:  # several libraries raise their own types of errors, from their own threads
             self._manager = self._open(self.folder)
             if self.latest == step and not _damage(self.folder / str(step)):
                 self._report(f"checkpoint of step {step}: its checksums could not be written: {error}")
@@ -95,30 +98,33 @@ class Checkpoints:
         """Reads a checkpoint.
 
         Args:
-            step: which.
-            like: the items to restore, as pytrees of arrays or shapes with their structure.
+            step: the checkpoint's step.
+            like: the items to restore, by name: pytrees of arrays or shapes with the same structure.
 
         Returns:
-            The items and the extra numbers.
+            The items and the extra values.
 
         Raises:
-            ValueError: if it does not hold these items.
+            ValueError: if the checkpoint does not hold these items.
         """
         restores = {name: ocp.args.StandardRestore(jax.tree.map(_stored, tree)) for name, tree in like.items()}
         try:
             restored = self._manager.restore(step, args=ocp.args.Composite(**restores, extra=ocp.args.JsonRestore()))
-        except Exception as error:  # Orbax and tensorstore have many types
+        except Exception as error:  # Orbax and TensorStore raise many types of errors
             reason = f"{type(error).__name__}: {str(error).strip().splitlines()[0]}"
             expected = f"what this version of milx writes; it is of {self._origin(step)}"
             raise ValueError(
                 f"{self.folder / str(step)}: cannot be restored, expected {expected} ({reason})"
             ) from error
-        # Orbax pins arrays to the device that they come to, and a program compiled for free ones would compile again.
+        # Orbax commits arrays to a device. Programs that were compiled for uncommitted arrays would be compiled again.
         free = lambda like, x: jnp.asarray(np.asarray(x) if like.size else np.zeros(like.shape, like.dtype))  # noqa: E731
         return {name: jax.tree.map(free, like[name], restored[name]) for name in like}, restored["extra"]
 
     def replace(self, step: int, items: dict[str, Any], score: float, extra: dict[str, Any]) -> bool:
-        """Writes the checkpoint of a step again, say with the score that it lacked; a copy is kept meanwhile."""
+        """Writes the checkpoint of a step again, for example with its score; a copy is kept until this is done.
+
+        The arguments and the result are those of `save`.
+        """
         copied = True
         if parallel.is_first_host():
             copy = self._replaced / str(step)
@@ -142,21 +148,21 @@ class Checkpoints:
         return written
 
     def score(self, step: int) -> float:
-        """Of a checkpoint's validation, or UNVALIDATED."""
+        """Returns the score of a checkpoint's validation, or UNVALIDATED."""
         return self._manager.metrics(step)["success"]
 
     def close(self) -> None:
-        """Ends Orbax's threads."""
+        """Stops Orbax's threads and deletes temporary files."""
         self._manager.close()
         if self._view:
             self._view.cleanup()
 
     def _origin(self, step: int) -> str:
-        """Which version of milx wrote a checkpoint, for a message."""
+        """Returns the versions of the software that wrote a checkpoint, as text for a message."""
         try:
             extra = self._manager.restore(step, args=ocp.args.Composite(extra=ocp.args.JsonRestore()))["extra"]
             return " and ".join(f"{name} {version}" for name, version in extra["versions"].items())
-        except Exception:  # it is the second thing to fail
+        except Exception:  # this is only for a message about an earlier error
             return "an unknown version"
 
     def _open(self, folder: pathlib.Path) -> ocp.CheckpointManager:
@@ -173,11 +179,11 @@ class Checkpoints:
 
     @property
     def _replaced(self) -> pathlib.Path:
-        """Where `replace` keeps a copy."""
+        """The folder of the copies that `replace` makes."""
         return self.folder.parent / "replaced"
 
     def _put_back(self) -> None:
-        """Ends what `replace` began: what is not there again is put back."""
+        """Finishes a `replace`: moves copies of missing or damaged checkpoints back and deletes all others."""
         for copy in self._replaced.glob("*"):
             target = self.folder / copy.name
             if copy.suffix or (target.is_dir() and not _damage(target)):
@@ -186,18 +192,22 @@ class Checkpoints:
             if target.is_dir():
                 _move_aside(target)
             copy.rename(target)
-        with contextlib.suppress(OSError):  # there is none, or not for us to remove
+        with contextlib.suppress(OSError):  # the folder does not exist or cannot be removed
             self._replaced.rmdir()
 
     def _without_damaged(self) -> pathlib.Path:
-        """A folder with the good checkpoints alone: this one, from which the damaged are moved, or one with links."""
+        """Returns a folder that holds only undamaged checkpoints.
+
+        It is the folder of the checkpoints, from which damaged ones have been moved. If that folder is read-only and
+        holds damaged checkpoints, it is a temporary folder with links to the others.
+        """
         if not self._read_only:
             if parallel.is_first_host():
                 self._put_back()
             parallel.wait_for_all()
         steps = sorted(path for path in self.folder.glob("*") if path.name.isdigit())
         damage = {path: problem for path in steps if (problem := _damage(path)) and path.is_dir()}
-        steps = [path for path in steps if path.is_dir()]  # a trainer may remove some while others look
+        steps = [path for path in steps if path.is_dir()]  # a training process may delete some at the same time
         for path, problem in damage.items():
             self._report(f"checkpoint {path} is damaged and not used: {problem}")
         if damage and len(damage) == len(steps):
@@ -208,24 +218,25 @@ class Checkpoints:
                 (pathlib.Path(self._view.name) / path.name).symlink_to(path)
             return pathlib.Path(self._view.name)
         if not self._read_only:
-            parallel.wait_for_all()  # every host has looked
+            parallel.wait_for_all()  # until every host has read the folder
             if parallel.is_first_host():
                 for path in damage:
                     _move_aside(path)
                 for path in set(steps) - set(damage):
-                    if not (path / _CHECKSUMS).is_file():  # of an earlier version, or the process was killed just then
+                    # It may be from an earlier version of milx, or from a process that was killed before this.
+                    if not (path / _CHECKSUMS).is_file():
                         _write_checksums(path)
             parallel.wait_for_all()
         return self.folder
 
 
 def _stored(x: Any) -> Any:
-    """An array as Orbax can store it, which knows none without entries."""
+    """Replaces an array without entries, which Orbax cannot store, by an array with one entry."""
     return x if np.size(x) else np.zeros(1, x.dtype)
 
 
 def _damage(checkpoint: pathlib.Path) -> str | None:
-    """What is wrong with a checkpoint's files; None if nothing is."""
+    """Describes what is wrong with a checkpoint's files; returns None if they are undamaged."""
     path = checkpoint / _CHECKSUMS
     if not (checkpoint / _METADATA).is_file():
         return f"{_METADATA} is missing"
@@ -247,7 +258,7 @@ def _damage(checkpoint: pathlib.Path) -> str | None:
 
 
 def _unreadable(checkpoint: pathlib.Path) -> str | None:
-    """What keeps a checkpoint without checksums from being read; None if nothing does."""
+    """Describes why a checkpoint without checksums cannot be read; returns None if it can."""
     for path in (checkpoint / "metrics" / "metrics", checkpoint / "extra" / "metadata"):
         try:
             json.loads(path.read_text())
@@ -257,7 +268,7 @@ def _unreadable(checkpoint: pathlib.Path) -> str | None:
         for item in sorted(path.parent for path in checkpoint.glob("*/manifest.ocdbt")):
             try:
                 reader.restore(item)
-            except Exception as error:  # Orbax and tensorstore have many types
+            except Exception as error:  # Orbax and TensorStore raise many types of errors
                 return f"{item.name} cannot be read ({type(error).__name__})"
     return None
 

@@ -1,4 +1,4 @@
-"""MJX, imported without the lines that it prints for each of its own optional packages that is not installed."""
+"""MJX, imported without the messages that it prints about its optional packages that are not installed."""
 
 import contextlib
 import io

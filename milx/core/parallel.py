@@ -1,7 +1,7 @@
-"""One or many devices, of one or many hosts: every batch of tasks is split over them along its leading axis.
+"""Work on one or many devices, of one or many hosts: a batch of tasks is split over them along its leading axis.
 
-There is one mesh with one axis, "tasks". Parameters and demonstrations are on every device; each device works on its
-share of the tasks, and gradients are averaged over all. Nothing random depends on how many devices there are.
+There is one mesh with one axis, "tasks". Parameters and demonstrations are on every device. Each device works on its
+part of the tasks, and gradients are averaged over all devices. Random numbers do not depend on the number of devices.
 """
 
 import functools
@@ -18,10 +18,15 @@ AXIS = "tasks"
 
 
 def join_hosts(coordinator: str | None = None, processes: int | None = None, process: int | None = None) -> None:
-    """Joins the other hosts of the run, if there are any; to be called before anything runs on a device.
+    """Connects the hosts of the run, if there are several; must be called before anything runs on a device.
 
-    Each host starts the same command. Under SLURM and on Cloud TPU pods the hosts find each other; elsewhere each is
-    told where the first one listens (`coordinator`, "address:port"), how many `processes` there are, and its number.
+    The same command is started on each host. Under SLURM and on Cloud TPU pods the hosts find each other. Elsewhere all
+    three arguments are needed.
+
+    Args:
+        coordinator: the first host's "address:port".
+        processes: number of hosts.
+        process: this host's number, from 0.
     """
     slurm = int(os.environ.get("SLURM_STEP_NUM_TASKS", "1")) > 1
     pod = "," in os.environ.get("TPU_WORKER_HOSTNAMES", "")
@@ -30,59 +35,59 @@ def join_hosts(coordinator: str | None = None, processes: int | None = None, pro
 
 
 def is_first_host() -> bool:
-    """Whether this process writes what only one must write."""
+    """Returns whether this process writes the files that only one process may write."""
     return jax.process_index() == 0
 
 
 def on_all_hosts(condition: bool) -> bool:
-    """Whether the condition holds in every process; all have to ask."""
+    """Returns whether the condition holds in every process; every process must call this function."""
     if jax.process_count() == 1:
         return condition
     return bool(multihost_utils.process_allgather(np.array(condition)).all())
 
 
 def wait_for_all() -> None:
-    """Until every process is here."""
+    """Waits until every process has called this function."""
     on_all_hosts(True)
 
 
 def on_any_host(condition: bool) -> bool:
-    """Whether the condition holds in some process; all have to ask."""
+    """Returns whether the condition holds in at least one process; every process must call this function."""
     return not on_all_hosts(not condition)
 
 
 @functools.cache
 def mesh() -> Mesh:
-    """All devices of all hosts."""
+    """Returns the mesh of all devices of all hosts."""
     return Mesh(jax.devices(), (AXIS,))
 
 
 def num_devices() -> int:
-    """How many devices share the tasks."""
+    """Returns the number of devices that the tasks are split over."""
     return mesh().size
 
 
 def round_up(size: int) -> int:
-    """The next number of tasks that the devices can share evenly."""
+    """Rounds a number of tasks up to a multiple of the number of devices."""
     return -(-size // num_devices()) * num_devices()
 
 
 def largest(x: jax.Array) -> jax.Array:
-    """The largest of the devices' scalars; to be called inside what `shard_tasks` runs."""
+    """Returns the maximum of a scalar over the devices; must be called inside a function that `shard_tasks` runs."""
     return jax.lax.pmax(x, AXIS)
 
 
 def shard_tasks(function: Callable[..., Any], *, shared: int = 0, average: bool = False) -> Callable[..., Any]:
-    """Runs `function` on every device with its share of the tasks.
+    """Makes `function` run on every device with the device's part of the tasks.
 
     Args:
-        function: of pytrees of arrays. It is called once on each device, inside `jax.jit`.
-        shared: the first so many arguments are the same on every device; the others are split along their leading
-            axis, whose size must be a multiple of `num_devices()`.
-        average: return the mean of the devices' results, instead of joining them along their leading axis.
+        function: a function of pytrees of arrays. It is called once on each device, inside `jax.jit`.
+        shared: number of leading arguments that are the same on every device. The other arguments are split along
+            their leading axis, whose size must be a multiple of `num_devices()`.
+        average: return the mean of the devices' results instead of joining them along their leading axis.
 
     Returns:
-        A function of the same arguments, whole. Its results are whole, too, and the same on every device.
+        A function that takes the same arguments before they are split. Each device gets the complete result.
     """
 
     def on_each(*args: Any) -> Any:
@@ -94,7 +99,7 @@ def shard_tasks(function: Callable[..., Any], *, shared: int = 0, average: bool 
     def call(*args: Any) -> Any:
         specs = tuple(everywhere if i < shared else split for i in range(len(args)))
         out = everywhere if average else split
-        # The rest of milx starts scans from constants, which the check of varying axes would refuse.
+        # Scans in milx start from constants, which the check of varying axes (check_vma) would reject.
         result = jax.shard_map(on_each, mesh=mesh(), in_specs=specs, out_specs=out, check_vma=False)(*args)
         return jax.lax.with_sharding_constraint(result, NamedSharding(mesh(), everywhere))
 

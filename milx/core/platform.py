@@ -1,4 +1,4 @@
-"""Set-up of the JAX platform: done once, by launchers or by the user, before JAX starts its backend."""
+"""Setup of the JAX platform, which a launcher or the user does once, before JAX starts its backend."""
 
 import os
 import pathlib
@@ -8,44 +8,44 @@ import jax
 import jaxlib
 
 _OLD_JAXLIB = tuple(int(part) for part in jaxlib.__version__.split(".")[:2]) < (0, 11)
-# CPU flags for jaxlib before 0.11; unknown flags are fatal, so later versions must not see them.
-# - Fusion emitters fuse MJX's kinematic chain by recomputing it, exponentially in the depth of the chain.
-# - The concurrent scheduler lets two batched LAPACK calls (MJX's Cholesky) wait for each other for ever.
+# CPU flags for jaxlib before 0.11. Unknown flags are fatal, so later versions must not get them.
+# - The fusion emitters fuse MJX's kinematic chain by recomputing it, with a cost exponential in the chain's depth.
+# - With the concurrent scheduler, two batched LAPACK calls (MJX's Cholesky) can wait for each other forever.
 _CPU_FLAGS = {
     "xla_cpu_use_fusion_emitters": "--xla_cpu_use_fusion_emitters=false",
     "xla_cpu_enable_concurrency_optimized_scheduler": "--xla_cpu_enable_concurrency_optimized_scheduler=false",
 }
 
 _SHORT_CHAIN = 3
-"""Joints in a chain whose recomputation costs nothing: a chain of seven takes four thousand times as long."""
+"""Joints in a kinematic chain that is cheap to recompute: a chain of seven takes four thousand times as long."""
 
 
 def cache_folder() -> pathlib.Path:
-    """The user's cache folder for milx: `$XDG_CACHE_HOME/milx`, or `~/.cache/milx`."""
+    """Returns the user's cache folder for milx: `$XDG_CACHE_HOME/milx`, or `~/.cache/milx`."""
     home = os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache"
     return pathlib.Path(home) / "milx"
 
 
 def pixel_options(chain: int = 0) -> dict[str, str | bool]:
-    """Compiler options for a program of pixels rather than physics.
+    """Returns compiler options for a program that mainly computes pixels, not physics.
 
-    On an old CPU compiler the fusion emitters that `configure` turns off render five times as fast.
+    With an old CPU compiler, rendering is five times as fast with the fusion emitters, which `configure` turns off.
 
     Args:
-        chain: joints in the longest kinematic chain that the program computes poses of.
+        chain: number of joints in the longest kinematic chain whose poses the program computes.
     """
     fuse = _OLD_JAXLIB and jax.default_backend() == "cpu" and chain <= _SHORT_CHAIN
     return {"xla_cpu_use_fusion_emitters": True} if fuse else {}
 
 
 def configure() -> None:
-    """Turns the persistent compilation cache on and works around slow MJX code of old CPU compilers.
+    """Turns on the persistent compilation cache, and sets XLA flags without which old CPU compilers are slow on MJX.
 
-    It must come before JAX is first used; importing JAX is no use of it. The cache lives in `cache_folder() / "jax"`;
-    `JAX_COMPILATION_CACHE_DIR` moves it.
+    It must be called before JAX is first used; JAX may be imported before. The cache is in `cache_folder() / "jax"`,
+    unless the environment variable `JAX_COMPILATION_CACHE_DIR` names another folder.
 
     Warns:
-        RuntimeWarning: if JAX has started already, without flags that MJX needs.
+        RuntimeWarning: if JAX has already started without flags that MJX needs.
     """
     if missing := _missing_flags():
         from jax._src import xla_bridge  # JAX before 0.11 has no public way to ask
@@ -60,7 +60,7 @@ def configure() -> None:
 
 
 def warn_if_not_configured() -> None:
-    """Warns where a program of MJX may take hours to compile, or wait for ever, for want of XLA flags.
+    """Warns if XLA flags are missing without which an MJX program may compile for hours, or wait forever.
 
     Warns:
         RuntimeWarning: on the CPU with jaxlib before 0.11, if `configure` has not been called.

@@ -1,4 +1,4 @@
-"""Pytrees of arrays: their names, a hash of their contents, and files of them."""
+"""Pytrees of arrays: the arrays' names, a hash of their contents, and files that store them."""
 
 import hashlib
 import os
@@ -16,13 +16,13 @@ from milx.core import parallel
 
 
 def leaves(tree: Any) -> dict[str, Any]:
-    """All arrays by name, such as "states.qpos", in a fixed order."""
+    """Returns all arrays by name, such as "states.qpos", in a fixed order."""
     pairs, _ = jax.tree_util.tree_flatten_with_path(tree)
     return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in pairs}
 
 
 def fingerprint(tree: Any) -> str:
-    """SHA-256 over names, types, shapes and contents of all arrays."""
+    """Computes the SHA-256 hash of the names, types, shapes and contents of all arrays."""
     digest = hashlib.sha256()
     for name, leaf in leaves(tree).items():
         array = np.ascontiguousarray(leaf)
@@ -32,7 +32,7 @@ def fingerprint(tree: Any) -> str:
 
 
 def save(path: pathlib.Path, tree: Any) -> None:
-    """Writes a pytree as one .npz file; a file of that name is replaced only once the new one is complete."""
+    """Writes a pytree as one .npz file; an existing file is replaced only when the new one is complete."""
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_suffix(f".partial{os.getpid()}.npz")
     arrays: dict[str, Any] = {name: np.asarray(leaf) for name, leaf in leaves(tree).items()}
@@ -45,10 +45,10 @@ def load(path: pathlib.Path, like: Any) -> Any:
 
     Args:
         path: the .npz file.
-        like: a pytree (of arrays or shapes) with the expected names, types and shapes, say from `jax.eval_shape`.
+        like: a pytree (of arrays or shapes) with the expected names, types and shapes, e.g. from `jax.eval_shape`.
 
     Raises:
-        ValueError: for an array that is missing or has another type or shape; the message names it.
+        ValueError: if an array is missing or has another type or shape; the message names the array.
     """
     loaded = []
     with np.load(path, allow_pickle=False) as arrays:
@@ -65,12 +65,15 @@ def load(path: pathlib.Path, like: Any) -> Any:
 
 
 def kept(path: pathlib.Path, make: Callable[[], Any], like: Callable[[], Any]) -> Any:
-    """What `make` returns, or returned before: it lies at `path`. A damaged file is reported and made again.
+    """Loads the pytree at `path`, or makes it and saves it there. A damaged file is reported and written again.
 
     Args:
         path: the .npz file.
-        make: makes the pytree.
-        like: the same in shapes.
+        make: returns the pytree.
+        like: returns a pytree of shapes with the same structure, as `load` needs it.
+
+    Returns:
+        The pytree.
     """
     if parallel.on_all_hosts(path.is_file()):
         try:

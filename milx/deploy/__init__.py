@@ -1,1 +1,1 @@
-"""Policies for users and robots."""
+"""Trained policies: loading them, using them, and exporting them for robots."""

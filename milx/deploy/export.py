@@ -1,9 +1,9 @@
-"""A policy as two programs that run with JAX alone, on CPU and CUDA, in a folder of five files.
+"""Export of a policy as two programs that run without milx, on CPU and CUDA, in a folder of five files.
 
-adapt.bin, act.bin      the programs (jax.export), with nothing of milx, Flax or MuJoCo in them
-params.npz              what was learnt, whitening included, and the memory at the start of an episode
-policy.json             the shapes that the programs want
-policy.py               loads all that: `milx/deploy/standalone.py`
+adapt.bin, act.bin      the programs, serialized by `jax.export`; they need neither milx nor Flax nor MuJoCo
+params.npz              the learned parameters with the whitening, and the memory at the start of an episode
+policy.json             the shapes of the programs' inputs
+policy.py               a copy of `milx/deploy/standalone.py`, which loads the other files
 """
 
 import json
@@ -29,9 +29,9 @@ def export(policy: Policy, out: str | pathlib.Path, shots: int = 1) -> None:
     """Writes a policy's programs and parameters.
 
     Args:
-        policy: from `milx.load`.
-        out: the folder; must not exist.
-        shots: K, how many demonstrations `adapt` takes.
+        policy: a policy from `milx.load`.
+        out: the folder to write; it must not exist.
+        shots: K, the number of demonstrations that `adapt` takes.
 
     Raises:
         ValueError: if the folder exists.
@@ -85,7 +85,7 @@ def export(policy: Policy, out: str | pathlib.Path, shots: int = 1) -> None:
 
 
 def input_shapes(policy: Policy, shots: int) -> dict[str, dict[str, list[int]]]:
-    """Shapes of the fields that "adapt" and "act" take."""
+    """Returns the shapes of the fields that "adapt" and "act" take, by program and field."""
     spec, config = policy.spec, policy.config
     horizon = config.recorded.horizon if config.recorded.path else envs.ENVS[config.env_name].horizon
     seen = {"state": [spec.state_size]} if spec.state_size else {}
@@ -98,7 +98,7 @@ def input_shapes(policy: Policy, shots: int) -> dict[str, dict[str, list[int]]]:
 
 
 def _with_state(fields: dict[str, jax.Array], spec: Spec) -> dict[str, jax.Array]:
-    """What is shown, with an empty state where there are no states."""
+    """Adds an empty state to the fields if the policy uses no states."""
     return fields if spec.state_size else {**fields, "state": jnp.zeros((*fields["image"].shape[:-3], 0))}
 
 

@@ -1,4 +1,4 @@
-"""The policy that users hold: loaded from a run, adapted to a demonstration, asked for actions."""
+"""The policy that users work with: it is loaded from a run, adapted to a demonstration, and asked for actions."""
 
 import dataclasses
 import functools
@@ -27,9 +27,9 @@ class Policy:
         action = policy.act(task_params, observation)
 
     Attributes:
-        method: how to adapt and act.
-        spec: the sizes of what it sees and does.
-        params: what meta-training has learnt.
+        method: the method, which adapts and acts.
+        spec: the sizes of observations and actions.
+        params: the meta-learned parameters.
         config: the run's configuration.
     """
 
@@ -39,49 +39,54 @@ class Policy:
     config: Config
 
     def adapt(self, params: Params, demo: Demo) -> Params:
-        """Learns a task from one demonstration [T, ...] or several [K, T, ...]; jitted.
+        """Adapts to a task from one demonstration [T, ...] or several [K, T, ...]; the computation is jitted.
 
         Args:
             params: `policy.params`.
-            demo: images [.., T, H, W, 3] uint8 (None for a policy that sees no pixels), states [.., T, S] and actions
-                [.., T, A], NumPy or JAX.
+            demo: images [..., T, H, W, 3] uint8 (None for a policy that sees no pixels), states [..., T, S] and actions
+                [..., T, A], as NumPy or JAX arrays.
 
         Returns:
-            task_params for `act`.
+            The parameters adapted to the task (`task_params`), for `act` and `step`.
 
         Raises:
-            ValueError: for a field that is missing, not wanted, or of a wrong shape or type, a value that is not
-                finite, or an action that the environment does not allow.
+            ValueError: for a field that is missing or has a wrong shape or type, an image for a policy that sees no
+                pixels, a value that is not finite, or an action outside the environment's limits.
         """
         return self._adapt(params, check_demo(demo, self.spec, self.config.method.given))
 
     def act(self, task_params: Params, observation: Observation) -> jax.Array:
-        """The action [A], in the environment's units, for one observation; jitted.
+        """Returns the action [A], in the environment's units, for one observation; the computation is jitted.
 
         Raises:
-            ValueError: for a field that is missing or has a wrong shape or type, or a value that is not finite; for a
-                policy that remembers.
+            ValueError: for a field that is missing or has a wrong shape or type, an image for a policy that sees no
+                pixels, or a value that is not finite. Also if the policy has a memory, which needs `step`.
         """
         if jax.tree.leaves(self.initial_memory):
             raise ValueError("memory: missing, expected `Policy.step`: this policy remembers what it saw first")
         return self.step(task_params, observation, self.initial_memory)[0]
 
     def step(self, task_params: Params, observation: Observation, memory: Memory) -> tuple[jax.Array, Memory]:
-        """The action, as in `act`, and what the policy remembers for the next observation; jitted.
+        """Returns the action, as `act` does, and the memory for the next time step; the computation is jitted.
 
         Args:
-            task_params: from `adapt`.
+            task_params: the parameters that `adapt` returned.
             observation: what the policy sees.
-            memory: `initial_memory` at the first time step of an episode, and then what the step before returned.
+            memory: `initial_memory` at the first time step of an episode, and then the memory that the previous call
+                returned.
+
+        Returns:
+            The action [A] and the next memory.
 
         Raises:
-            ValueError: for a field that is missing or has a wrong shape or type, or a value that is not finite.
+            ValueError: for a field that is missing or has a wrong shape or type, an image for a policy that sees no
+                pixels, or a value that is not finite.
         """
         return self._step(task_params, check_observation(observation, self.spec), memory)
 
     @functools.cached_property
     def initial_memory(self) -> Memory:
-        """What the policy remembers at the start of an episode; empty for most policies."""
+        """The memory at the start of an episode; empty for most policies."""
         return self.method.initial_memory(jax.random.key(0))
 
     @functools.cached_property
@@ -97,10 +102,10 @@ def load_run(run: str | pathlib.Path) -> Policy:
     """Loads the best policy of a run.
 
     Args:
-        run: the run's folder, as `python -m milx.train` leaves it.
+        run: the run's folder, as `python -m milx.train` writes it.
 
     Raises:
-        ValueError: if the folder holds no run, or no checkpoint yet.
+        ValueError: if the folder holds no run, or the run has no checkpoint yet.
     """
     folder = pathlib.Path(run)
     path = folder / "config.json"
@@ -123,10 +128,18 @@ def load_run(run: str | pathlib.Path) -> Policy:
 
 
 def check_demo(demo: Demo, spec: Spec, given: str = GIVEN[0]) -> Demo:
-    """Checks demonstrations, leaves out what is not `given`, adds their goals, and gives them their leading axis K.
+    """Checks one demonstration [T, ...] or several [K, T, ...], and prepares them for `Method.adapt`.
+
+    Args:
+        demo: the demonstrations.
+        spec: the sizes of observations and actions.
+        given: the parts to keep, one of GIVEN.
+
+    Returns:
+        Demonstrations [K, T, ...] with only the parts that are `given`, and with goals if their states tell them.
 
     Raises:
-        ValueError: naming the field, what came and what was expected.
+        ValueError: if a field is not as expected; the message names it, its value and what was expected.
     """
     if not isinstance(demo, Demo):
         raise ValueError(f"demo: got {type(demo).__name__}, expected a milx.Demo")
@@ -151,7 +164,7 @@ def check_demo(demo: Demo, spec: Spec, given: str = GIVEN[0]) -> Demo:
 
 
 def with_goals(demo: Demo, spec: Spec) -> Demo:
-    """Demonstrations [K, T, ...] with their goals, if their states tell them."""
+    """Adds the goals to demonstrations [K, T, ...] if they can be read from the states."""
     if demo.state is None or not spec.goal_indices:
         return demo
     goal = jax.vmap(lambda state: goals(state, spec.goal_indices, spec.height_index))(demo.state)
@@ -174,7 +187,7 @@ def check_observation(observation: Observation, spec: Spec) -> Observation:
     """Checks one observation.
 
     Raises:
-        ValueError: naming the field, what came and what was expected.
+        ValueError: if a field is not as expected; the message names it, its value and what was expected.
     """
     if not isinstance(observation, Observation):
         raise ValueError(f"observation: got {type(observation).__name__}, expected a milx.Observation")
@@ -205,7 +218,7 @@ def _check_image(field: str, value: Any, lead: tuple[int, ...], spec: Spec) -> j
 
 
 def _check_state(field: str, value: Any, lead: tuple[int, ...], spec: Spec) -> np.ndarray:
-    """The state; where there are no states, none is asked for."""
+    """Checks states; None is allowed if the policy uses no states, and becomes an empty array."""
     if value is None and not spec.state_size:
         return np.zeros((*lead, 0), np.float32)
     return _check_vector(field, value, (*lead, spec.state_size))

@@ -15,12 +15,12 @@ FOLDER = pathlib.Path(__file__).parent / "weights"
 
 
 def names() -> list[str]:
-    """The policies that there are."""
+    """Returns the names of the policies that ship with milx."""
     return sorted(path.parent.name for path in FOLDER.glob("*/params.npz"))
 
 
 def result(name: str) -> dict[str, Any]:
-    """What one of them reached: the evaluation.json of its run, and `pytrees.fingerprint` of the parameters."""
+    """Reads a policy's result: its run's evaluation.json, and `pytrees.fingerprint` of its parameters."""
     return json.loads((FOLDER / name / "result.json").read_text())
 
 
@@ -28,10 +28,10 @@ def load(run: str | pathlib.Path) -> Policy:
     """Loads the best policy of a run, or one that ships with milx.
 
     Args:
-        run: the run's folder, as `python -m milx.train` leaves it, or a name.
+        run: the run's folder, as `python -m milx.train` writes it, or the name of a policy that ships with milx.
 
     Raises:
-        ValueError: for neither, or a run that has no checkpoint yet.
+        ValueError: if it is neither, or if the run has no checkpoint yet.
     """
     is_run = (pathlib.Path(run) / "config.json").is_file()
     if is_run or (pathlib.Path(run).exists() and run not in names()):
@@ -47,12 +47,12 @@ def load(run: str | pathlib.Path) -> Policy:
 
 
 def save(trained: Policy, reached: dict[str, Any], folder: pathlib.Path) -> None:
-    """Writes a policy as `load` reads it.
+    """Writes a policy in the format of those that ship with milx.
 
     Args:
-        trained: the policy of a run in an environment.
-        reached: the run's evaluation.json, configuration included.
-        folder: where to.
+        trained: the policy of a run in simulation.
+        reached: the contents of the run's evaluation.json, with the configuration.
+        folder: the folder to write to.
     """
     pytrees.save(folder / "params.npz", trained.params)
     digest = pytrees.fingerprint(trained.params)

@@ -1,4 +1,4 @@
-"""A policy that `python -m milx.export` wrote: JAX, its flatbuffers and NumPy are all that it needs.
+"""A policy written by `python -m milx.export`. It needs only JAX, NumPy and flatbuffers.
 
 from policy import Policy
 
@@ -18,15 +18,15 @@ import numpy as np
 
 
 class Policy:
-    """What was learnt, and the two programs that use it.
+    """The learned parameters and the two programs that use them.
 
     Args:
-        folder: as the export left it.
+        folder: the folder that the export wrote.
 
     Attributes:
-        sizes: shapes [K, T, ...] of what `adapt` wants, and [...] of what `act` wants, by field.
-        params: what was learnt.
-        initial_memory: what the policy remembers at the start of an episode; empty for most policies.
+        sizes: the shapes of the inputs, by field: [K, T, ...] for "adapt" and [...] for "act".
+        params: the learned parameters.
+        initial_memory: the memory at the start of an episode; empty for most policies.
     """
 
     def __init__(self, folder):
@@ -42,18 +42,19 @@ class Policy:
         )
 
     def adapt(self, **demo):
-        """Learns a task from one demonstration, or several of the same length.
+        """Adapts to a task from one demonstration, or from several of the same length.
 
         Args:
-            **demo: "image" uint8 [T, H, W, 3], "state" [T, S] and "action" [T, A], as far as the policy wants them; T
-                is any number of steps, of which as many as the policy wants are kept. With K demonstrations there is
-                another axis in front.
+            **demo: "image" uint8 [T, H, W, 3], "state" [T, S] and "action" [T, A]; exactly those that `sizes["adapt"]`
+                lists. T may be any number of time steps; the demonstration is resampled to the policy's number, at
+                even intervals. With K > 1 demonstrations, all fields have a leading axis K.
 
         Returns:
-            What `act` needs of the task.
+            The parameters adapted to the task (`task_params`), for `act` and `step`.
 
         Raises:
-            ValueError: for a field that is missing, not wanted, or of a wrong shape or type.
+            ValueError: for a field that is missing, not expected, or has a wrong shape or type, a value that is not
+                finite, or another number of demonstrations than the policy was exported for.
         """
         wanted = self.sizes["adapt"]
         values, lengths = {}, {}
@@ -69,23 +70,32 @@ class Policy:
         return self._adapt(self.params, values)
 
     def act(self, task_params, **observation):
-        """The action [A] for one observation: "image" uint8 [H, W, 3] and "state" [S], as far as it wants them.
+        """Returns the action [A] for one observation.
+
+        Args:
+            task_params: the parameters that `adapt` returned.
+            **observation: "image" uint8 [H, W, 3] and "state" [S]; exactly those that `sizes["act"]` lists.
 
         Raises:
-            ValueError: for a field that is missing, not wanted, or of a wrong shape or type; for a policy that
-                remembers.
+            ValueError: for a field that is missing, not expected, or has a wrong shape or type, or a value that is not
+                finite. Also if the policy has a memory, which needs `step`.
         """
         if self.initial_memory:
             raise ValueError("memory: missing, expected `step`: this policy remembers what it saw first")
         return self.step(task_params, self.initial_memory, **observation)[0]
 
     def step(self, task_params, memory, **observation):
-        """The action, as in `act`, and what the policy remembers for the next observation.
+        """Returns the action, as `act` does, and the memory for the next time step.
 
-        `memory` is `initial_memory` at the first time step of an episode, and then what the step before returned.
+        Args:
+            task_params: the parameters that `adapt` returned.
+            memory: `initial_memory` at the first time step of an episode, and then the memory that the previous call
+                returned.
+            **observation: as in `act`.
 
         Raises:
-            ValueError: for a field that is missing, not wanted, or of a wrong shape or type.
+            ValueError: for a field that is missing, not expected, or has a wrong shape or type, or a value that is not
+                finite.
         """
         return self._act(task_params, self._checked(observation, self.sizes["act"], lead=0), memory)
 
