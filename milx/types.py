@@ -86,10 +86,10 @@ class Spec:
         action_size: A.
         action_range: minimum and maximum of each entry of the action; None if actions have no limits.
         goal_indices: indices of the G entries of the state from which goals are read (`milx.data.goals`).
-        image_to_goal: [3][G] affine map from (x, y, 1), with x and y in [-1, 1] across and down the image, to those
-            entries. It comes from the camera's calibration; None if that is unknown.
-        object_indices: [O][2] indices of the entries of the state that hold each object's position, if the state
-            contains them.
+        image_to_goal: three rows of G numbers, the affine map from (x, y, 1), with x and y in [-1, 1] across and down
+            the image, to those entries. It comes from the camera's calibration; None if that is unknown.
+        object_indices: for each of the O objects the two indices of the entries of the state that hold its position,
+            if the state contains them.
         height_index: index of the entry of the state that holds the height of the hand, in environments where the hand
             must come down to an object; None otherwise.
     """

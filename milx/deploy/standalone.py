@@ -9,6 +9,7 @@ while True:
 """
 
 import json
+import os
 import pathlib
 
 import jax
@@ -29,7 +30,7 @@ class Policy:
         initial_memory: the memory at the start of an episode; empty for most policies.
     """
 
-    def __init__(self, folder):
+    def __init__(self, folder: str | os.PathLike):
         folder = pathlib.Path(folder)
         self.sizes = json.loads((folder / "policy.json").read_text())
         with np.load(folder / "params.npz", allow_pickle=False) as arrays:
@@ -38,10 +39,11 @@ class Policy:
                 for of_memory in (False, True)
             )
         self._adapt, self._act = (
-            jax.jit(jax.export.deserialize((folder / f"{name}.bin").read_bytes()).call) for name in ("adapt", "act")
+            jax.jit(jax.export.deserialize(bytearray((folder / f"{name}.bin").read_bytes())).call)
+            for name in ("adapt", "act")
         )
 
-    def adapt(self, **demo):
+    def adapt(self, **demo: np.ndarray) -> list[jax.Array]:
         """Adapts to a task from one demonstration, or from several of the same length.
 
         Args:
@@ -69,7 +71,7 @@ class Policy:
             raise ValueError(f"time steps: got {lengths}, expected the same of all fields")
         return self._adapt(self.params, values)
 
-    def act(self, task_params, **observation):
+    def act(self, task_params: list[jax.Array], **observation: np.ndarray) -> jax.Array:
         """Returns the action [A] for one observation.
 
         Args:
@@ -84,7 +86,9 @@ class Policy:
             raise ValueError("memory: missing, expected `step`: this policy remembers what it saw first")
         return self.step(task_params, self.initial_memory, **observation)[0]
 
-    def step(self, task_params, memory, **observation):
+    def step(
+        self, task_params: list[jax.Array], memory: list[jax.Array], **observation: np.ndarray
+    ) -> tuple[jax.Array, list[jax.Array]]:
         """Returns the action, as `act` does, and the memory for the next time step.
 
         Args:
@@ -100,7 +104,7 @@ class Policy:
         return self._act(task_params, self._checked(observation, self.sizes["act"], lead=0), memory)
 
     @staticmethod
-    def _checked(values, wanted, lead):
+    def _checked(values: dict, wanted: dict, lead: int) -> dict[str, np.ndarray]:
         if set(values) != set(wanted):
             raise ValueError(f"fields: got {sorted(values)}, expected {sorted(wanted)}")
         checked = {}
