@@ -241,6 +241,10 @@ class Env(abc.ABC):
         )
         return state.with_vector(x)
 
+    def approximate_step(self, task: Task, state: State, action: jax.Array) -> State:
+        """Approximates `step` for the planner, which differentiates it; the same as `step` unless overridden."""
+        return self.step(task, state, action)
+
     def integrate(self, model: mjx.Model, state: State, ctrl: jax.Array) -> jax.Array:
         """One physics step of the model's time step: the next `state.vector`."""
         data = mjx.step(model, self.data(state).replace(ctrl=ctrl))

@@ -31,6 +31,7 @@ def plan(env: Env, task: Task, state: State, options: Options) -> Plan:
         terminal_residual=lambda x: env.terminal_residual(task, state.with_vector(x)),
         control_low=low,
         control_high=high,
+        approximation=lambda x, u: env.approximate_step(task, state.with_vector(x), u).vector,
     )
     return solve(problem, state.vector, env.guess(task, state), options)
 

@@ -46,6 +46,8 @@ class Problem(NamedTuple):
         terminal_residual: r_T, maps x [n] to a vector.
         control_low: [m], may be -inf.
         control_high: [m], may be inf.
+        approximation: a cheaper function from which A and B are computed instead of from f; None for f itself. Rollouts
+            and their costs are always those of f.
     """
 
     dynamics: Callable[[jax.Array, jax.Array], jax.Array]
@@ -53,6 +55,7 @@ class Problem(NamedTuple):
     terminal_residual: Callable[[jax.Array], jax.Array]
     control_low: jax.Array
     control_high: jax.Array
+    approximation: Callable[[jax.Array, jax.Array], jax.Array] | None = None
 
 
 @jax.tree_util.register_dataclass
@@ -131,8 +134,10 @@ def _backward(problem: Problem, states: jax.Array, actions: jax.Array, mu: jax.A
     """
     n, m = states.shape[-1], actions.shape[-1]
 
+    dynamics = problem.approximation or problem.dynamics
+
     def stage(x, u, t):
-        return problem.dynamics(x, u), problem.running_residual(x, u, t)
+        return dynamics(x, u), problem.running_residual(x, u, t)
 
     ((A, B), (r_x, r_u)), (_, r) = linearize(stage, states[:-1], actions, jnp.arange(len(actions), dtype=jnp.int32))
     r_T, r_Tx = problem.terminal_residual(states[-1]), jax.jacfwd(problem.terminal_residual)(states[-1])

@@ -81,6 +81,22 @@ def test_same_controls_give_the_trajectory_of_c_mujoco(env, actions, states):
         np.testing.assert_allclose(states.qvel[i], qvel, rtol=0, atol=1e-9)
 
 
+def test_the_planner_s_step_is_close_to_the_exact_one(env, task, actions, states):
+    """One step of the midpoint method is off by the third power of its length; the planner needs its Jacobians."""
+    states, _ = states
+    inside = np.abs(actions).max(axis=(1, 2)) < 0.5
+    x = np.asarray(jnp.concatenate([states.qpos, states.qvel], axis=-1))[inside, :-1].reshape(-1, 4)
+    u, scene = actions[inside].reshape(-1, 2), env.reset(jax.random.key(4), task)
+
+    def model(step):
+        return jax.jit(lambda x, u: linearize(lambda x, u: step(task, scene.with_vector(x), u).vector, x, u))(x, u)
+
+    ((A, B), after), ((A_exact, B_exact), after_exact) = (model(step) for step in (env.approximate_step, env.step))
+    np.testing.assert_allclose(after, after_exact, rtol=0, atol=2e-3)
+    np.testing.assert_allclose(A, A_exact, rtol=0, atol=1e-4 * np.abs(A_exact).max())
+    np.testing.assert_allclose(B, B_exact, rtol=0, atol=1e-3 * np.abs(B_exact).max())
+
+
 def test_jacobians_of_an_action_are_differences_of_c_mujoco(env, task, states):
     """Central differences with steps of 1e-6 are off by about 1e-12 / 1e-6 from rounding, and less from curvature."""
     states, _ = states

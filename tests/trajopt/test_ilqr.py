@@ -110,6 +110,22 @@ def test_one_iteration_solves_lq_as_riccati_does(lqs, stacked_lqs):
         np.testing.assert_allclose(plans.gains[i], gains, atol=1e-9)
 
 
+def test_derivatives_of_a_coarse_model_lead_to_nearly_the_optimal_cost(lqs):
+    # Errors of 3% in A and B: the cost of what is found, in the true dynamics, misses the optimum by their square.
+    error = np.random.default_rng(7).uniform(-0.03, 0.03, (2, 4, 4))
+    options = ilqr.Options(iterations=100, tolerance=1e-10)
+    for lq in (jax.tree.map(jnp.asarray, lq) for lq in lqs):
+        exact = lq_problem(lq, np.inf)
+        A, B = lq["A"] * (1 + error[0]), lq["B"] * (1 + error[1, :, :2])
+        coarse = exact._replace(approximation=lambda x, u, A=A, B=B: A @ x + B @ u)
+        best, found = (ilqr.solve(problem, lq["x_0"], lq["guess"], options) for problem in (exact, coarse))
+        assert best.cost <= found.cost <= 1.01 * best.cost
+        x = lq["x_0"]
+        for u, after in zip(found.actions, found.states[1:], strict=True):
+            x = lq["A"] @ x + lq["B"] @ u
+            np.testing.assert_allclose(after, x, atol=1e-9)
+
+
 def test_expected_change_of_lq_is_exact(lqs):
     # Whatever μ and α are: μ changes the policy, and the expected change is that of the policy found.
     lq = jax.tree.map(jnp.asarray, lqs[0])
