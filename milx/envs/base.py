@@ -67,7 +67,8 @@ class Env(abc.ABC):
         goal_indices: entries of the robot's state that tell where it is heading (`milx.data.goals`).
         height_index: the entry that tells how high its hand is, where it must come down to an object; None otherwise.
         vision: whether the policy sees the image; if not, the state tells it where the objects are.
-        object_indices: [O][2] entries of the state with each object's place, where the state tells them.
+        object_indices: for each of the O objects, the two entries of the state that hold its position, where the state
+            tells it.
         tactics: ways in which the controller may go about a scene, in the order of preference; what the numbers mean is
             the controller's affair.
         action_cost: weight of the action in the planner's running cost (no unit): the lower, the faster the expert.
