@@ -72,7 +72,7 @@ def test_last_output_shows_the_demonstration_beside_another_rollout(executed):
     left, right = frames[:, :, :width].astype(int), frames[:, :, -width:].astype(int)
     gap = frames[:, 2:-2, width + 2 : -width - 2]
     assert gap.min() > 240
-    # The cubes stand elsewhere from the first frame on, in the same colours.
+    # The cubes stand elsewhere from the first frame on, in the same colors.
     assert (np.abs(left - right).max(axis=-1) > 40).mean(axis=(1, 2)).min() > 0.01
     # Both arms move.
     for half in (left, right):
@@ -103,7 +103,7 @@ def test_a_task_of_ones_own_is_planned_trained_and_judged(execute):
     assert (np.ptp(rows), np.ptp(columns)) == (4, 4), "the mark"
 
 
-def test_demonstrations_of_ones_own_are_learnt_from(execute):
+def test_demonstrations_of_ones_own_are_learned_from(execute):
     """Their answer is known: what is adapted to a demonstration must beat what is adapted to another task's."""
     text = printed(execute("bring_your_own_demonstrations", steps=400, tasks=0))
     errors = {name: float(re.search(rf"^{name} +([\d.]+)", text, re.MULTILINE).group(1)) for name in NAMES}

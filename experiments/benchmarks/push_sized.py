@@ -1,4 +1,4 @@
-"""A world of the size of the paper's push experiment, for measuring speed: nothing is learnt in it.
+"""A world of the size of the paper's push experiment, for measuring speed: nothing is learned in it.
 
 Seven torque-controlled joints, an object and a distractor of five primitives each that slide and turn in the plane, 24
 geoms, 125x125 pixels, 100 steps.
@@ -82,7 +82,7 @@ XML = f"""
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Looks:
-    """The task: [G, 3] colours."""
+    """The task: [G, 3] colors."""
 
     color: jax.Array
 
@@ -104,11 +104,11 @@ class PushSized(Env):
         self._effector = self.mj_model.site("effector").id
 
     def sample_task(self, key: jax.Array, split: str) -> Looks:
-        """Random colours."""
+        """Random colors."""
         return Looks(jax.random.uniform(key, (self.mj_model.ngeom, 3)))
 
     def redraw_appearance(self, key: jax.Array, task: Looks) -> Looks:
-        """Other colours."""
+        """Other colors."""
         return self.sample_task(key, "train")
 
     def redraw_scene(self, key: jax.Array, task: Looks, states: State) -> State:

@@ -77,7 +77,7 @@ def measure_warp(env: Env, count: int) -> tuple[float, None]:
     compiled = jax.jit(render, compiler_options={"xla_gpu_graph_min_graph_size": 1})
     image = compiled(mx, data)
     if not jnp.any(image != image.ravel()[0]):
-        raise RuntimeError("the image has one colour only")
+        raise RuntimeError("the image has one color only")
     return 1e3 * count / common.median_ms(compiled, mx, data), None
 
 

@@ -23,8 +23,8 @@ def same(x: torch.Tensor, kernel: int, stride: int) -> torch.Tensor:
 def norm(x: torch.Tensor) -> torch.Tensor:
     """Layer norm over all axes but the first; written out, for the sake of its second derivative."""
     axes = tuple(range(1, x.ndim))
-    centred = x - x.mean(axes, keepdim=True)
-    return centred * torch.rsqrt(centred.square().mean(axes, keepdim=True) + 1e-6)
+    centered = x - x.mean(axes, keepdim=True)
+    return centered * torch.rsqrt(centered.square().mean(axes, keepdim=True) + 1e-6)
 
 
 def make_params(config: Config, image: tuple[int, int], state: int, action: int) -> dict[str, torch.Tensor]:

@@ -69,7 +69,7 @@ def methods_of(env: str, chosen: list[str] | None) -> list[str]:
 def configure(env: str, method: str, preset: str, seed: int, steps: int | None) -> Config:
     """A preset as methods are compared: at their own rates, in `steps` meta-updates or STEPS, without redrawn scenes.
 
-    A small set of demonstrations is to be small in colours and places, too. On vision reach eight time steps of the
+    A small set of demonstrations is to be small in colors and places, too. On vision reach eight time steps of the
     query and three layers learn faster than the three and two of `fast`, which end a little higher.
     """
     config = make_config(env, method, preset, seed)

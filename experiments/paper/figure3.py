@@ -23,7 +23,7 @@ import milx
 from milx.evaluation.results import intervals
 
 TITLES = {
-    "reach": "vision, held-out colours",
+    "reach": "vision, held-out colors",
     "reach_state": "state, held-out scenes",
     "push": "push, held-out objects and textures",
     "place": "place, held-out objects and textures",

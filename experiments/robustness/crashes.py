@@ -42,7 +42,7 @@ FLAGS = (
 
 
 def write_data(folder: pathlib.Path) -> None:
-    """A data set of noise: what is learnt does not matter."""
+    """A data set of noise: what is learned does not matter."""
     rng = np.random.default_rng(0)
     with Writer(folder, (12, 16), 3, 2, "crashes.py") as writer:
         for task in range(12):

@@ -18,7 +18,7 @@ _SPREAD = 3
 
 
 def problems(data: DataSet) -> list[str]:
-    """What will go wrong, a sentence each, the worst first; reads all states and actions, and the first images."""
+    """Finds what will go wrong, a sentence each, the worst first; reads all states, all actions and first images."""
     found, head = [], data.header
     for split in SPLITS:
         if not head.of_split(split):
@@ -27,7 +27,7 @@ def problems(data: DataSet) -> list[str]:
         if len(task.lengths) < 2:
             found.append(f"task {task.name!r} has {len(task.lengths)} demonstration: one more must be the query")
         elif not any(task.has_action):
-            found.append(f"task {task.name!r} shows no actions: it cannot be learnt from")
+            found.append(f"task {task.name!r} shows no actions: it cannot be learned from")
     lengths = [length for task in head.tasks for length in task.lengths]
     if lengths and max(lengths) > _SPREAD * min(lengths):
         found.append(f"lengths from {min(lengths)} to {max(lengths)} steps: all are resampled to recorded.horizon")
@@ -45,12 +45,12 @@ def problems(data: DataSet) -> list[str]:
         if head.image_shape is not None and task.lengths:
             image = data.read(number, 0, np.zeros(1, int), fields=("image",)).image
             if image.min() == image.max():
-                found.append(f"task {task.name!r}: the first image is of one colour")
+                found.append(f"task {task.name!r}: the first image is of one color")
     return found
 
 
 def vectors(data: DataSet) -> dict[str, np.ndarray]:
-    """All states [F, S] and actions [F', A] there are.
+    """Reads all states [F, S] and actions [F', A].
 
     Raises:
         ValueError: if they are too large for the memory.

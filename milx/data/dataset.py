@@ -70,7 +70,7 @@ class Header:
     source: str = ""
 
     def of_split(self, split: str) -> list[int]:
-        """The numbers of the split's tasks."""
+        """Lists the numbers of the split's tasks."""
         return [i for i, task in enumerate(self.tasks) if task.split == split]
 
 
@@ -183,7 +183,7 @@ class DataSet:
         self._arrays: dict[tuple[int, str], Any] = {}
 
     def fingerprint(self) -> str:
-        """SHA-256 of the header and of all states and actions; images are told by their sizes alone."""
+        """Computes the SHA-256 of the header and of all states and actions; images count by their sizes alone."""
         digest = hashlib.sha256(json.dumps(dataclasses.asdict(self.header)).encode())
         for i in range(len(self.header.tasks)):
             for field in ("state", "action"):
@@ -196,7 +196,7 @@ class DataSet:
     def read(
         self, task: int, demo: int, frames: np.ndarray | None = None, fields: tuple[str, ...] = ALL_FIELDS
     ) -> Demo:
-        """A demonstration of a task, NumPy arrays [T, ...]; only these `frames` and `fields` if they are given."""
+        """Reads a demonstration of a task, NumPy arrays [T, ...]; only these `frames` and `fields` if any are given."""
         return self.read_later(task, demo, frames, fields)()
 
     def read_later(
@@ -258,7 +258,7 @@ def check_size(field: str, shape: tuple[int, ...], itemsize: int) -> None:
 
 
 def spread(length: int, horizon: int) -> np.ndarray:
-    """[horizon] time steps spread evenly over a demonstration, the first and the last among them.
+    """Spreads [horizon] time steps evenly over a demonstration, the first and the last among them.
 
     Steps are repeated where the demonstration is shorter. What was done at a step stays what was done there, so
     nothing needs to be interpolated.
@@ -267,7 +267,7 @@ def spread(length: int, horizon: int) -> np.ndarray:
 
 
 def _fields(header: Header) -> dict[str, tuple[tuple[int, ...], Any]]:
-    """Shape of a time step and type of every array."""
+    """Returns the shape of a time step and the type of every array."""
     fields: dict[str, tuple[tuple[int, ...], Any]] = {"action": ((header.action_size,), np.float32)}
     if header.state_size:
         fields["state"] = ((header.state_size,), np.float32)

@@ -48,7 +48,7 @@ class Source(Protocol):
     sizes: Sizes
 
     def episodes(self, task: str) -> list[Episode]:
-        """All episodes; `task` says what makes a task."""
+        """Lists all episodes; `task` says what makes a task."""
 
 
 def define_flags(*, state: str, action: str, task: str) -> None:
@@ -63,7 +63,7 @@ def define_flags(*, state: str, action: str, task: str) -> None:
 
 
 def run(argv: list[str], open_source: Callable[[str, Any], Source]) -> None:
-    """The command line of an importer: PATH OUT; bad input ends with a message, not a traceback."""
+    """Runs the command line of an importer: PATH OUT; bad input ends with a message, not a traceback."""
     if len(argv) != 3:
         raise app.UsageError("expected two arguments, PATH and OUT")
     try:
@@ -101,7 +101,7 @@ def write(
 
 
 def assign_splits(names: list[str], validation: float, test: float) -> dict[str, str]:
-    """The split of every task, in an order that depends on nothing but the names; at least one trains.
+    """Assigns a split to every task, in an order that depends on nothing but the names; at least one trains.
 
     Raises:
         ValueError: unless the parts are at least 0 and leave something for training.
@@ -121,7 +121,7 @@ def assign_splits(names: list[str], validation: float, test: float) -> dict[str,
 
 
 def read_mapping(path: str | pathlib.Path) -> dict[str, str]:
-    """A JSON object from the names of episodes to the names of their tasks.
+    """Reads a JSON object from the names of episodes to the names of their tasks.
 
     Raises:
         ValueError: for a file that holds something else.
@@ -136,7 +136,7 @@ def read_mapping(path: str | pathlib.Path) -> dict[str, str]:
 
 
 def lookup(mapping: dict[str, str], name: str, path: str) -> str:
-    """The task of an episode.
+    """Looks up the task of an episode.
 
     Raises:
         ValueError: if the mapping does not say.
@@ -149,7 +149,7 @@ def lookup(mapping: dict[str, str], name: str, path: str) -> str:
 
 
 def inside(root: pathlib.Path, path: str | pathlib.Path) -> pathlib.Path:
-    """A file of a data set, as its metadata names it.
+    """Finds a file of a data set, as its metadata names it, inside the data set's folder.
 
     Raises:
         ValueError: if that leads out of the data set's folder, by "..", an absolute path or a link, or to no file.
@@ -167,13 +167,13 @@ def inside(root: pathlib.Path, path: str | pathlib.Path) -> pathlib.Path:
 
 
 def shrunk(shape: tuple[int, ...], height: int) -> tuple[int, int]:
-    """(H, W) of an image of this shape with at most `height` rows, in the same proportions."""
+    """Computes (H, W) of an image of this shape shrunk to at most `height` rows, in the same proportions."""
     scale = min(1.0, height / shape[0])
     return max(1, round(scale * shape[0])), max(1, round(scale * shape[1]))
 
 
 def resized(images: Iterator[np.ndarray], shape: tuple[int, int]) -> Iterator[np.ndarray]:
-    """Images [H, W, 3] uint8, each as large as `shape`; means over areas where they shrink."""
+    """Resizes images [H, W, 3] uint8 to `shape`; each yields means over areas where it shrinks."""
     for image in images:
         if image.shape[:2] != shape:
             image = np.asarray(Image.fromarray(image).resize(shape[::-1], Image.Resampling.BOX))

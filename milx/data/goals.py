@@ -5,7 +5,7 @@ import jax.numpy as jnp
 
 
 def goals(state: jax.Array, indices: tuple[int, ...], height: int | None) -> jax.Array:
-    """The goal of every time step, [T, G].
+    """Computes the goal of every time step, [T, G].
 
     Without a `height` it is where the demonstration ends. With one, it is where the hand first comes down from above
     the middle of its heights to below, and from then on unknown (NaN): where the hand is would be the answer then, and

@@ -56,7 +56,7 @@ class LeRobot:
         self.sizes = Sizes(image_shape, vector(state), vector(action))
 
     def episodes(self, task: str) -> list[Episode]:
-        """All episodes.
+        """Lists all episodes.
 
         Args:
             task: "task_index", "file", or the path of a JSON file.
@@ -101,7 +101,7 @@ class LeRobot:
         return Demo(image, state, action)
 
     def _video(self, row: dict[str, Any]) -> Iterator[np.ndarray]:
-        """The episode's part of its video file."""
+        """Reads the episode's part of its video file."""
         prefix = f"videos/{self.camera}"
         values = {"video_key": self.camera}
         values |= {name: row[f"{prefix}/{name}"] for name in ("chunk_index", "file_index")}
@@ -109,7 +109,7 @@ class LeRobot:
         yield from read_video(file, row[f"{prefix}/from_timestamp"], row["length"], self.info["fps"])
 
     def _rows(self) -> list[dict[str, Any]]:
-        """What meta/episodes says of every episode, in order."""
+        """Reads what meta/episodes says of every episode, in order."""
         columns = ["episode_index", "tasks", "length", "data/chunk_index", "data/file_index"]
         if self.camera and self.info["features"][self.camera]["dtype"] == "video":
             prefix = f"videos/{self.camera}"
@@ -192,7 +192,7 @@ class LeRobot:
 
 
 def read_video(file: pathlib.Path, start: float, count: int, fps: float) -> Iterator[np.ndarray]:
-    """Frames [H, W, 3] uint8 of a video: `count` of them, from `start` (s), 1/fps apart.
+    """Reads `count` frames [H, W, 3] uint8 of a video, from `start` (s) on, 1/fps apart.
 
     Raises:
         ValueError: if the file is no video, or has no frame at one of those times.
@@ -228,7 +228,7 @@ def _images(file: pathlib.Path, values: list[Any]) -> Iterator[np.ndarray]:
 
 
 def _fill(template: Any, values: dict[str, Any]) -> str:
-    """A path with numbers and names in place of {name} and {name:03d}; nothing else is understood."""
+    """Fills numbers and names into a path in place of {name} and {name:03d}; nothing else is understood."""
 
     def replace(match: re.Match[str]) -> str:
         name, width = match.groups()
@@ -241,7 +241,7 @@ def _fill(template: Any, values: dict[str, Any]) -> str:
 
 @functools.lru_cache(maxsize=2)
 def _read_table(file: pathlib.Path, columns: tuple[str, ...]) -> Any:
-    """Some columns of a parquet file, of which one is "episode_index", unless they are missing or too large."""
+    """Reads columns of a parquet file, "episode_index" among them, unless they are missing or too large."""
     try:
         import pyarrow
         import pyarrow.parquet

@@ -120,7 +120,7 @@ def sample_batch(
 
 
 def with_goals(demo: Demo, indices: tuple[int, ...]) -> Demo:
-    """A demonstration [T, ...] with its goals, if entries of the state tell them."""
+    """Adds the goals to a demonstration [T, ...], if entries of the state tell them."""
     return dataclasses.replace(demo, goal=goals(demo.state, indices, None)) if indices else demo
 
 
@@ -161,7 +161,7 @@ class Shards:
         return shape_of(self.data, self.num_tasks, self.num_demos, self.horizon)
 
     def at(self, scan: int) -> Recorded:
-        """The shard of a scan; the next one's is begun."""
+        """Returns the shard of a scan, and begins to read the next one's."""
         if self.whole:
             scan = 0
         for wanted in (scan, scan if self.whole else scan + 1):
@@ -178,7 +178,7 @@ class Shards:
         return jax.device_put(jax.tree.map(pad, loaded))
 
     def chosen(self, scan: int) -> tuple[list[int], list[list[int]]]:
-        """The numbers of a shard's tasks, and of the demonstrations of each."""
+        """Chooses the tasks of a shard and the demonstrations of each, and returns their numbers."""
         rng = np.random.default_rng([self.seed, scan])
         tasks = self.tasks if self.whole else rng.choice(self.tasks, self.num_tasks, replace=False).tolist()
         demos = []

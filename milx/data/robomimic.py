@@ -52,7 +52,7 @@ class Robomimic:
         self.sizes = Sizes(None if shape is None else shared.shrunk(shape, height), size, actions)
 
     def episodes(self, task: str) -> list[Episode]:
-        """All demonstrations.
+        """Lists all demonstrations.
 
         Args:
             task: "file", or the path of a JSON file.
@@ -69,7 +69,7 @@ class Robomimic:
         return found
 
     def _names(self, demo: str) -> dict[str, int]:
-        """The data sets that are read of a demonstration, and their axes."""
+        """Names the data sets that are read of a demonstration, and their axes."""
         names = {f"data/{demo}/obs/{name}": 2 for name in self.state}
         if self.camera:
             names[f"data/{demo}/obs/{self.camera}"] = 4
@@ -116,7 +116,7 @@ def _open(path: pathlib.Path) -> Any:
 
 
 def _demos(file: Any) -> list[str]:
-    """The names of the demonstrations, demo_2 before demo_10."""
+    """Lists the names of the demonstrations, demo_2 before demo_10."""
     names = _members(file, "data")
     if not names:
         raise ValueError(f"{file.filename}: expected demonstrations under data/, there are none")
@@ -125,7 +125,7 @@ def _demos(file: Any) -> list[str]:
 
 
 def _dataset(file: Any, name: str, axes: int) -> Any:
-    """An HDF5 data set, unless it is missing, of another shape, too large, or stored outside the file."""
+    """Opens an HDF5 data set, unless it is missing, of another shape, too large, or stored outside the file."""
     import h5py
 
     _check_links(file, name)
@@ -144,7 +144,7 @@ def _dataset(file: Any, name: str, axes: int) -> Any:
 
 
 def _members(file: Any, name: str) -> list[str]:
-    """The names in a group; none if it is no group."""
+    """Lists the names in a group; none if it is no group."""
     import h5py
 
     _check_links(file, name)

@@ -111,7 +111,7 @@ def _without_diverged(states: State, action: jax.Array, success: jax.Array) -> t
 
 @functools.partial(jax.jit, static_argnums=(0, 2, 3, 4))
 def _draw(env: Env, key: jax.Array, split: str, num_tasks: int, num_demos: int) -> tuple[Task, Task, State, jax.Array]:
-    """Tasks [N]; then, for each of the N D demonstrations, its task, the scene it starts from and a key for noise."""
+    """Samples tasks [N] and, for each of the N D demonstrations, its task, its first scene, and a key for noise."""
     task_key, scene_key, noise_key = jax.random.split(key, 3)
     total = num_tasks * num_demos
     tasks = jax.vmap(env.sample_task, in_axes=(0, None))(jax.random.split(task_key, num_tasks), split)
@@ -197,7 +197,7 @@ def sample_batch(
 
 
 def sampler(env: Env, train: TrainConfig) -> Callable[[DemoSet, jax.Array], TaskBatch]:
-    """`sample_batch` as a run has it configured: a function of demonstrations and keys."""
+    """Configures `sample_batch` for a run, and returns a function of demonstrations and keys."""
 
     def sample(demos: DemoSet, keys: jax.Array) -> TaskBatch:
         frames = train.support_frames, train.query_frames
@@ -227,7 +227,7 @@ def shapes(env: Env, num_tasks: int, num_demos: int) -> DemoSet:
 def cached(
     folder: pathlib.Path, env: Env, seed: int, split: str, num_tasks: int, num_demos: int, config: DataConfig
 ) -> DemoSet:
-    """`collect`, or what it gave before: sets are kept in `folder` under a hash of all that they depend on.
+    """Returns what `collect` does, from `folder` if it is there: sets are kept under a hash of all that they depend on.
 
     The hash covers the arguments, the kind of device, and the versions of JAX, MuJoCo, the environment and the experts.
     How many demonstrations are planned at once is left out: it changes no more than rounding.

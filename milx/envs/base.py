@@ -1,6 +1,6 @@
 """The environment interface: pure functions of a task and a state, batched by `jax.vmap`.
 
-A *task* says what is to be done and how the world looks (colours, shapes, masses); every demonstration and trial of a
+A *task* says what is to be done and how the world looks (colors, shapes, masses); every demonstration and trial of a
 task starts in another *scene* (positions), which lives in the state. Both are pytrees of arrays.
 """
 
@@ -42,11 +42,11 @@ class State:
 
     @property
     def vector(self) -> jax.Array:
-        """[nq + nv]: the part of the state that the dynamics change, as trajectory optimisation sees it."""
+        """[nq + nv]: the part of the state that the dynamics change, as trajectory optimization sees it."""
         return jnp.concatenate([self.qpos, self.qvel], axis=-1)
 
     def with_vector(self, x: jax.Array) -> "State":
-        """The same scene with `qpos` and `qvel` taken from `x` [nq + nv]."""
+        """Returns the same scene with `qpos` and `qvel` taken from `x` [nq + nv]."""
         nq = self.qpos.shape[-1]
         return dataclasses.replace(self, qpos=x[..., :nq], qvel=x[..., nq:])
 
@@ -135,7 +135,7 @@ class Env(abc.ABC):
         return None
 
     def image_to_plane(self, low: tuple[float, float], high: tuple[float, float], height: float) -> np.ndarray:
-        """[3, 2] from (x, y, 1) to the x and y (m) of what is seen there, between `low` and `high` at this height.
+        """Returns [3, 2], from (x, y, 1) to the x and y (m) of what is seen there between `low` and `high`.
 
         Exact for a camera that looks straight down, else the least squares over that part of the plane.
         """
@@ -161,11 +161,11 @@ class Env(abc.ABC):
 
     @abc.abstractmethod
     def redraw_appearance(self, key: jax.Array, task: Task) -> Task:
-        """The task with another appearance of the training split; its demonstrations are valid for both."""
+        """Changes the task's appearance to another of the training split; its demonstrations are valid for both."""
 
     @abc.abstractmethod
     def redraw_scene(self, key: jax.Array, task: Task, states: State) -> State:
-        """The same episode in another scene: what did not take part in it stands elsewhere, as `reset` would put it.
+        """Moves what did not take part in an episode to where `reset` might have put it.
 
         `states` has a leading axis T + 1. Where everything takes part, this is `states`.
         """
@@ -176,27 +176,27 @@ class Env(abc.ABC):
 
     @abc.abstractmethod
     def robot_state(self, state: State) -> jax.Array:
-        """[S] what the robot knows of itself, and of the objects where there is no image (units in the subclass)."""
+        """Returns [S], what the robot knows of itself and, where there is no image, of the objects (units below)."""
 
     @abc.abstractmethod
     def colors(self, task: Task) -> jax.Array:
-        """[G, 4] RGBA of every geom in this task, in [0, 1]."""
+        """Returns [G, 4] RGBA in [0, 1] of every geom in this task."""
 
     def textures(self, task: Task, data: mjx.Data) -> Textures | None:
-        """[G] of every geom, with frames that take the world's; none unless overridden."""
+        """Returns the textures [G] of all geoms, with frames that take the world's; none unless overridden."""
         return None
 
     @abc.abstractmethod
     def running_residual(self, task: Task, state: State, action: jax.Array, t: jax.Array) -> jax.Array:
-        """[R] the running cost's residual at step t: the expert minimises half its square."""
+        """Computes the residual [R] of the running cost at step t; the expert minimizes half its square."""
 
     @abc.abstractmethod
     def terminal_residual(self, task: Task, state: State) -> jax.Array:
-        """[R'] the terminal cost's residual."""
+        """Computes the residual [R'] of the terminal cost."""
 
     @abc.abstractmethod
     def success(self, task: Task, states: State) -> jax.Array:
-        """Whether an episode succeeded. `states` has a leading axis T + 1; returns a bool scalar."""
+        """Tells whether an episode succeeded. `states` has a leading axis T + 1; returns a bool scalar."""
 
     def other_criteria(self, task: Task, states: State) -> dict[str, jax.Array]:
         """Success by other measures, by what they ask for; reported beside, none unless overridden."""
@@ -204,14 +204,14 @@ class Env(abc.ABC):
 
     @abc.abstractmethod
     def task_blind(self, key: jax.Array, task: Task) -> Task:
-        """The task as someone understands it who saw no demonstration: a random candidate is the target."""
+        """Makes a random candidate the target, as someone would who saw no demonstration."""
 
     def target_kind(self, task: Task) -> jax.Array:
-        """A number for the kind of thing that the task's target is; -1 where every task has its own, the default."""
+        """Returns a number for the kind of the task's target; -1, the default, where every task has its own."""
         return jnp.asarray(-1)
 
     def control(self, task: Task, state: State, tactic: jax.Array) -> jax.Array:
-        """[A] a controller that knows the task, with one of the `tactics`: it demonstrates where iLQR does not.
+        """Returns the action [A] of a controller that knows the task, by one of the `tactics`. It may replace iLQR.
 
         Raises:
             ValueError: unless overridden.
@@ -219,16 +219,16 @@ class Env(abc.ABC):
         raise ValueError(f"data.plan_iterations: got 0, expected at least 1: {self.name} has no controller")
 
     def guess(self, task: Task, state: State) -> jax.Array:
-        """[T, A] actions with which the planner begins; nothing unless overridden."""
+        """Returns actions [T, A] with which the planner begins; zero unless overridden."""
         return jnp.zeros((self.horizon, self.action_size))
 
     def model_of(self, task: Task) -> mjx.Model:
-        """The model with the task's shapes, masses and friction; the same for all tasks unless overridden."""
+        """Returns the model with the task's shapes, masses and friction; the same for all tasks unless overridden."""
         del task
         return self.model
 
     def data(self, state: State) -> mjx.Data:
-        """MJX data holding this state; derived quantities are not computed yet."""
+        """Makes MJX data that hold this state; derived quantities are not computed yet."""
         return self._data.replace(qpos=state.qpos, qvel=state.qvel, mocap_pos=state.mocap_pos)
 
     @functools.partial(jax.jit, static_argnums=0)  # so that MJX, slow to trace, is traced once for all callers
@@ -247,27 +247,27 @@ class Env(abc.ABC):
         return self.step(task, state, action)
 
     def integrate(self, model: mjx.Model, state: State, ctrl: jax.Array) -> jax.Array:
-        """One physics step of the model's time step: the next `state.vector`."""
+        """Takes one physics step, of the model's time step, and returns the next `state.vector`."""
         data = mjx.step(model, self.data(state).replace(ctrl=ctrl))
         return jnp.concatenate([data.qpos, data.qvel])
 
     @functools.partial(jax.jit, static_argnums=0)
     def observe(self, task: Task, state: State) -> Observation:
-        """What the policy sees: image [H, W, 3] uint8, None without vision, and state [S]."""
+        """Shows what the policy sees: the image [H, W, 3] uint8 (None without vision) and the state [S]."""
         image = self.render(task, state) if self.vision else None
         return Observation(image=image, state=self.robot_state(state))
 
     @functools.partial(jax.jit, static_argnums=0)
     def render(self, task: Task, state: State) -> jax.Array:
-        """The camera's image [H, W, 3] uint8 of the task's scene."""
+        """Draws the camera's image [H, W, 3] uint8 of the task's scene."""
         return self._draw(self.model_of(task), task, state)
 
     def film(self, task: Task, states: State) -> jax.Array:
-        """Images [F, H, W, 3] uint8 of an episode, whose `states` have a leading axis T + 1, and of what follows it."""
+        """Draws images [F, H, W, 3] uint8 of an episode and its outcome; `states` has a leading axis T + 1."""
         return jax.vmap(self.render, in_axes=(None, 0))(task, states)
 
     def _draw(self, model: mjx.Model, task: Task, state: State) -> jax.Array:
-        """The image of a state in this model."""
+        """Draws the image of a state in this model."""
         data = mjx.kinematics(model, self.data(state))
         data = mjx.camlight(model, mjx.com_pos(model, data))
         scene = dataclasses.replace(

@@ -85,7 +85,7 @@ def _run_batch(
 
 
 def _tasks_at_once(env: Env, action: jax.Array) -> int:
-    """Of tasks with demonstrations [N, K, T, A]."""
+    """Computes how many tasks to run at once, of demonstrations [N, K, T, A]."""
     shots, length = action.shape[1:3]
     return _PIXELS // (shots * length * math.prod(env.image_shape)) if env.vision else len(action)
 
@@ -104,7 +104,7 @@ def run_trials(
     Args:
         env: the environment.
         method: what adapts and acts.
-        params: what it has learnt.
+        params: what it has learned.
         demos: held-out tasks; the policy adapts to the first `config.shots` demonstrations of each.
         config: trials, shots and batch.
         key: draws the trial scenes.
@@ -140,7 +140,7 @@ def _listen(env: Env, method: Method, params: Params, demos: DemoSet, shots: int
 
 
 def listen(env: Env, method: Method, params: Params, demos: DemoSet, shots: int) -> dict[str, float]:
-    """What `listening.measure` finds on held-out tasks: adapted to `shots` demonstrations, asked for the next one's.
+    """Measures `listening.measure` on held-out tasks: adapts to `shots` demonstrations and asks for the next one's.
 
     Nothing where there are fewer than two tasks, or fewer tasks than devices.
     """
@@ -168,7 +168,7 @@ class Floors(NamedTuple):
 
 
 def baselines(env: Env, demos: DemoSet, config: EvalConfig, expert: DataConfig, key: jax.Array) -> Floors:
-    """What random actions, the task-blind expert and the expert reach in the same trials.
+    """Evaluates random actions, the task-blind expert and the expert in the same trials.
 
     They run in the first `config.baseline_trials` of every task's trials. The task-blind expert goes to a random
     candidate; the expert does without noise what it planned or rehearsed.
@@ -203,7 +203,7 @@ def baselines(env: Env, demos: DemoSet, config: EvalConfig, expert: DataConfig, 
 
 @functools.partial(jax.jit, static_argnums=0)
 def film(camera: Env, task: Task, states: State) -> jax.Array:
-    """Images [N, F, H, W, 3] uint8 of episodes of N tasks: `states` has leading axes [N, T + 1].
+    """Draws images [N, F, H, W, 3] uint8 of episodes of N tasks: `states` has leading axes [N, T + 1].
 
     `camera` is the environment with the wanted image size.
     """
@@ -211,7 +211,7 @@ def film(camera: Env, task: Task, states: State) -> jax.Array:
 
 
 def summarize(env: Env, config: Config, task: Task, trials: Trials, misled: Trials, floors: Floors) -> dict[str, Any]:
-    """What the result file of a run says of its evaluation: what was asked and what came out, by every criterion.
+    """Summarizes an evaluation for a result file: what was asked and what came out, by every criterion.
 
     Args:
         env: the environment.

@@ -8,16 +8,16 @@ _RESAMPLES = 2000
 
 
 def wilson_interval(successes: int, trials: int, z: float = 1.959964) -> tuple[float, float]:
-    """Wilson's score interval of a success rate (Wilson 1927); 95% by default."""
+    """Computes Wilson's score interval of a success rate (Wilson 1927); 95% by default."""
     rate, spread = successes / trials, z * z / trials
-    centre = (rate + spread / 2) / (1 + spread)
+    center = (rate + spread / 2) / (1 + spread)
     half = math.sqrt(rate * (1 - rate) * spread + spread * spread / 4) / (1 + spread)
     # Rounding must not put the rate itself outside.
-    return max(min(centre - half, rate), 0.0), min(max(centre + half, rate), 1.0)
+    return max(min(center - half, rate), 0.0), min(max(center + half, rate), 1.0)
 
 
 def bootstrap_interval(success: np.ndarray, kind: np.ndarray) -> tuple[float, float]:
-    """The 95% percentile interval of a success rate over kinds of things, which are drawn with replacement.
+    """Computes the 95% percentile interval of a success rate over kinds of objects, drawn with replacement.
 
     Trials with the same thing are not independent: how a policy does with things that it has never seen is known from
     as many things as there are, not as many trials (the cluster bootstrap; Davison and Hinkley 1997, Section 3.8).

@@ -33,8 +33,8 @@ def measure(method: Method, params: Params, batch: TaskBatch, most: int | None =
 
     Args:
         method: what adapts and acts.
-        params: what it has learnt.
-        batch: N tasks, of which neighbours should differ.
+        params: what it has learned.
+        batch: N tasks, of which neighbors should differ.
         most: tasks that a device adapts to at once; all if None.
 
     Returns:
@@ -70,12 +70,12 @@ def measure(method: Method, params: Params, batch: TaskBatch, most: int | None =
 
 
 def is_deaf(found: dict[str, float]) -> bool:
-    """Whether the errors of `measure` say that the demonstration makes no difference."""
+    """Tells whether the errors of `measure` say that the demonstration makes no difference."""
     return "other_demo" in found and found["other_demo"] <= (1 + MARGIN) * found["own_demo"]
 
 
 def advice(has_inner_step: bool) -> str:
-    """What a run says that does not listen, and what to try."""
+    """Says what to try when a run does not listen."""
     remedies = "more tasks in a meta-batch (train.meta_batch), or whitened actions (mil.whiten_actions)"
     if has_inner_step:
         remedies = f"imitation first (method.imitation_steps), another method.inner_lr, {remedies}"
@@ -83,13 +83,13 @@ def advice(has_inner_step: bool) -> str:
 
 
 def in_words(found: dict[str, float]) -> str:
-    """The errors of `measure` for people, to be put behind something else."""
+    """Puts the errors of `measure` into words, to follow a semicolon."""
     parts = [f"{found[name]:.2f} with {words}" for name, words in ERRORS.items() if name in found]
     return f"; error of the actions {', '.join(parts)} demonstration" if parts else ""
 
 
 def _squared_error(method: Method, task_params: Params, query: Demo) -> jax.Array:
-    """[A] mean over the time steps of demonstrations [Q, T, ...]."""
+    """Averages squared errors over the time steps of demonstrations [Q, T, ...]: [A]."""
     action = jax.vmap(functools.partial(replay, method, task_params))(query)
     return jnp.square(action - query.action).mean(axis=(0, 1))
 
@@ -100,5 +100,5 @@ def _steps(before: Params, after: Params) -> dict[str, jax.Array]:
 
     moved = jax.tree.map(lambda x, y: jax.vmap(lambda y: size(y - x))(y).mean(), before, after)
     tensors, changes = pytrees.leaves(before), pytrees.leaves(moved)
-    learnt = {name: x for name, x in tensors.items() if x.size and not name.startswith("whitening.")}
-    return {f"step/{name}": changes[name] / jnp.maximum(size(x), _SMALLEST) for name, x in learnt.items()}
+    learned = {name: x for name, x in tensors.items() if x.size and not name.startswith("whitening.")}
+    return {f"step/{name}": changes[name] / jnp.maximum(size(x), _SMALLEST) for name, x in learned.items()}

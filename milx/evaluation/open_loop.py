@@ -22,12 +22,12 @@ def task_errors(
     mean: jax.Array,
     scale: jax.Array,
 ) -> dict[str, jax.Array]:
-    """Mean squared errors of the actions on a task's queries, in units of `scale`.
+    """Computes mean squared errors of the actions on a task's queries, in units of `scale`.
 
     Args:
         method: what adapts and acts.
         shots: K.
-        params: what it has learnt.
+        params: what it has learned.
         queries: [D, T, ...] demonstrations to predict the actions of.
         support: [K, T, ...] demonstrations to adapt to.
         other: demonstrations of another task; None for none.

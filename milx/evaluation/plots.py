@@ -61,7 +61,7 @@ def _listening(axis: Axes, metrics: list[dict[str, Any]]) -> None:
 
 
 def _curve(metrics: list[dict[str, Any]], name: str) -> tuple[list[int], list[float]]:
-    """The steps whose line has this number, and the numbers."""
+    """Reads the steps whose line has this number, and the numbers."""
     lines = [line for line in metrics if name in line]
     return [line["step"] for line in lines], [line[name] for line in lines]
 

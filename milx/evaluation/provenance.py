@@ -14,7 +14,7 @@ _PACKAGES = ("milx", "jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "
 
 
 def origin() -> dict[str, Any]:
-    """Commit (with "-dirty" for a changed tree; None outside a checkout), hardware and versions, for a result file."""
+    """Collects commit ("-dirty" if the tree has changed; None outside a checkout), hardware and versions."""
     return {"commit": _commit(), "hardware": _hardware(), "versions": versions(_PACKAGES)}
 
 
@@ -37,7 +37,7 @@ def _hardware() -> str:
 
 
 def versions(packages: Iterable[str]) -> dict[str, str]:
-    """Python's version and those of packages, "not installed" for those that lack."""
+    """Looks up Python's version and those of packages, "not installed" for those that lack."""
     found = {"python": platform.python_version()}
     for package in packages:
         try:

@@ -13,7 +13,7 @@ from milx.evaluation import provenance
 def compose(
     config: Config, found: dict[str, Any], seconds: dict[str, float], step: int, dataset_hash: str
 ) -> dict[str, Any]:
-    """A result as its JSON file holds it: what was run, what came out, what it took, and where.
+    """Composes a result for its JSON file: what was run, what came out, what it took, and where.
 
     Args:
         config: what was run.
@@ -38,7 +38,7 @@ def compose(
 
 
 def intervals(runs: list[dict[str, Any]]) -> list[tuple[float, float]]:
-    """The 95% intervals of the success in result files, all of one kind.
+    """Computes the 95% intervals of the success in result files, all of one kind.
 
     They are over held-out things ("bootstrap95") if every file has them, else over trials ("wilson95").
     """

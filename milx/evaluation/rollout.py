@@ -38,7 +38,7 @@ def rollout(
 
 
 def replay(method: Method, task_params: Params, demo: Demo) -> jax.Array:
-    """The actions [T, A] that an adapted policy chooses on the observations of one demonstration [T, ...].
+    """Chooses actions [T, A] by an adapted policy on the observations of one demonstration [T, ...].
 
     A policy that remembers sees them one after the other; any other sees them all at once.
     """

@@ -16,7 +16,7 @@ class Method(abc.ABC):
 
     @property
     def imitation_steps(self) -> int:
-        """How many meta-updates, the first, minimise `imitation` instead of `loss`."""
+        """How many meta-updates, the first, minimize `imitation` instead of `loss`."""
         return 0
 
     @abc.abstractmethod
@@ -27,13 +27,13 @@ class Method(abc.ABC):
     def loss(
         self, params: Params, batch: TaskBatch, progress: jax.Array | float = 1.0
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """The meta-objective of a batch of N tasks, a scalar; and values worth a curve, [N] each, "loss" among them.
+        """Computes the meta-objective of a batch of N tasks, a scalar, and metrics, [N] each, "loss" among them.
 
         `progress` is the part of the run that is done, in [0, 1].
         """
 
     def imitation(self, params: Params, batch: TaskBatch) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """As `loss`, but without an inner step, to start from; for methods that have one (`imitation_steps`)."""
+        """Computes the loss without an inner step, to start from; for methods that have one (`imitation_steps`)."""
         raise NotImplementedError
 
     @abc.abstractmethod
@@ -41,7 +41,7 @@ class Method(abc.ABC):
         """Learns a task from demonstrations with axes [K, T, ...]; returns `task_params`."""
 
     def unadapted(self, params: Params) -> Params | None:
-        """`task_params` before any demonstration, with the structure that `adapt` returns; None if there are none."""
+        """Returns `task_params` before any demonstration, with the structure of what `adapt` returns, or None."""
         del params
         return None
 
@@ -50,6 +50,6 @@ class Method(abc.ABC):
         """Chooses the action [A], in the environment's units, for one observation; returns it and the next memory."""
 
     def initial_memory(self, key: jax.Array) -> Memory:
-        """The memory at the start of an episode; `key` is for methods that act at random."""
+        """Returns the memory at the start of an episode; `key` is for methods that act at random."""
         del key
         return ()

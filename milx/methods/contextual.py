@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from milx.config.schema import Config, MethodConfig
 from milx.methods.base import Method
-from milx.methods.imitation import behavioural_cloning, calibrate_goal_head, calibration, flat, shown
+from milx.methods.imitation import behavioral_cloning, calibrate_goal_head, calibration, flat, shown
 from milx.methods.whitening import Whitening
 from milx.networks.attention import AttentiveActor, ObjectTokens
 from milx.networks.encoders import (
@@ -61,7 +61,7 @@ class ContextPolicy(Method):
     def loss(
         self, params: Params, batch: TaskBatch, progress: jax.Array | float = 1.0
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """Imitation of the queries, averaged over the tasks and the support demonstrations; and its parts, [N]."""
+        """Computes the imitation loss of the queries, averaged over tasks and demonstrations, and its parts, [N]."""
 
         def task_loss(support: Demo, query: Demo) -> tuple[jax.Array, dict[str, jax.Array]]:
             task_params = self.adapt(params, support)
@@ -70,7 +70,7 @@ class ContextPolicy(Method):
 
             def one(context: Any) -> tuple[jax.Array, dict[str, jax.Array]]:
                 output = self.network.apply(task_params, context, seen.image, whitening.state(seen.state))
-                return behavioural_cloning(self.config, output, output.action, query, whitening, self.goal_indices)
+                return behavioral_cloning(self.config, output, output.action, query, whitening, self.goal_indices)
 
             return jax.tree.map(jnp.mean, jax.vmap(one)(task_params["context"]))
 
@@ -78,7 +78,7 @@ class ContextPolicy(Method):
         return loss.mean(), {"loss": loss, **metrics}
 
     def act(self, task_params: Params, observation: Observation, memory: Memory) -> tuple[jax.Array, Memory]:
-        """The mean over the contexts of the actor's action."""
+        """Averages the actor's actions over the contexts."""
         whitening, batch = task_params["whitening"], jax.tree.map(lambda x: x[None], observation)
         state = whitening.state(batch.state)
         apply = jax.vmap(lambda context: self.network.apply(task_params, context, batch.image, state).action[0])

@@ -26,11 +26,11 @@ def shown(demo: Demo, given: str, whitening: Whitening) -> Demo:
 
 
 def flat(demo: Demo) -> Demo:
-    """All time steps of demonstrations [K, T, ...], one after the other."""
+    """Joins all time steps of demonstrations [K, T, ...], one after the other."""
     return jax.tree.map(lambda x: x.reshape(x.shape[0] * x.shape[1], *x.shape[2:]), demo)
 
 
-def behavioural_cloning(
+def behavioral_cloning(
     config: MethodConfig,
     output: PolicyOutput,
     action: jax.Array,
@@ -38,7 +38,7 @@ def behavioural_cloning(
     whitening: Whitening,
     goal_indices: tuple[int, ...],
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """The mean squared error of the actions (eq. 2), plus the error of the goal head or target head where there is one.
+    """Computes the mean squared error of the actions (eq. 2), plus that of the goal or target head if there is one.
 
     Args:
         config: scale and weight of the losses.
@@ -61,7 +61,7 @@ def behavioural_cloning(
 def head_losses(
     output: PolicyOutput, demo: Demo, whitening: Whitening, goal_indices: tuple[int, ...]
 ) -> dict[str, jax.Array]:
-    """The errors of the goal head and of the target head, where there is one and `demo` tells the goal."""
+    """Computes the errors of the goal head and of the target head, if there is one and `demo` tells the goal."""
     losses = {}
     if demo.goal is not None and output.goal is not None:
         losses["goal_loss"] = goal_loss(output.goal, demo.goal, whitening, goal_indices)
@@ -71,12 +71,12 @@ def head_losses(
 
 
 def goal_loss(predicted: Goal, goal: jax.Array, whitening: Whitening, goal_indices: tuple[int, ...]) -> jax.Array:
-    """The mean negative log likelihood of goals [K, T, G], predicted for all time steps one after the other."""
+    """Computes the mean negative log-likelihood of goals [K, T, G], predicted for all time steps in a row."""
     return _mean_where_known(predicted.negative_log_likelihood, goal, whitening, goal_indices)
 
 
 def target_loss(target: jax.Array, goal: jax.Array, whitening: Whitening, goal_indices: tuple[int, ...]) -> jax.Array:
-    """The mean squared error, entry by entry, of a target head's [K T, G] for goals [K, T, G], in whitened units."""
+    """Computes the mean squared error of a target head's [K T, G] for goals [K, T, G], whitened, over all entries."""
 
     def error(white: jax.Array) -> jax.Array:
         return jnp.square(target - white).mean(axis=-1)
@@ -87,7 +87,7 @@ def target_loss(target: jax.Array, goal: jax.Array, whitening: Whitening, goal_i
 def _mean_where_known(
     error: Callable[[jax.Array], jax.Array], goal: jax.Array, whitening: Whitening, goal_indices: tuple[int, ...]
 ) -> jax.Array:
-    """The mean of an error [K T] of whitened goals [K T, G]; where a goal is not known (NaN) there is none."""
+    """Averages an error [K T] of whitened goals [K, T, G] over the known goals; a goal that is not known is NaN."""
     indices = jnp.array(goal_indices)
     white = ((goal - whitening.state_mean[indices]) / whitening.state_scale[indices]).reshape(-1, len(goal_indices))
     known = jnp.isfinite(white).all(axis=-1)
@@ -96,7 +96,7 @@ def _mean_where_known(
 
 
 def calibration(config: Config, spec: Spec) -> tuple[tuple[float, ...], ...] | None:
-    """The camera's calibration (`Spec.image_to_goal`), if goal heads are to start from it."""
+    """Returns the camera's calibration (`Spec.image_to_goal`) if goal heads are to start from it."""
     calibrated = config.network.goal_head and config.network.calibrate and spec.image_shape is not None
     return spec.image_to_goal if calibrated else None
 
@@ -107,7 +107,7 @@ def calibrate_goal_head(
     goal_indices: tuple[int, ...],
     whitening: Whitening,
 ) -> Params:
-    """A policy's parameters with its goal heads started from the calibration (`Spec.image_to_goal`) if known."""
+    """Starts a policy's goal heads from the calibration (`Spec.image_to_goal`), if it is known."""
     if image_to_goal is None:
         return policy
     indices = jnp.array(goal_indices)

@@ -1,11 +1,11 @@
-"""Meta-imitation learning: MAML through a step of behavioural cloning (paper, Section 4).
+"""Meta-imitation learning: MAML through a step of behavioral cloning (paper, Section 4).
 
 For a task with demonstrations d (support) and d' (query) of the same goal in different scenes,
 
     theta' = theta - alpha clip(grad_theta L(theta, d))          the inner step (Section 3.2)
-    minimise over theta the mean over tasks of L(theta', d')     the meta-objective (eq. 1, a sum there)
+    minimize over theta the mean over tasks of L(theta', d')     the meta-objective (eq. 1, a sum there)
 
-with the behavioural cloning loss of K demonstrations of T time steps and actions in R^A,
+with the behavioral cloning loss of K demonstrations of T time steps and actions in R^A,
 
     L(theta, d) = 1 / (K T A) sum over k, t, i of (m (a_kti - pi_theta(o_kt)_i))^2,
 
@@ -24,7 +24,7 @@ import jax.numpy as jnp
 from milx.config.schema import GIVEN, Config, MethodConfig, number
 from milx.methods.base import Method
 from milx.methods.imitation import (
-    behavioural_cloning,
+    behavioral_cloning,
     calibrate_goal_head,
     calibration,
     flat,
@@ -69,7 +69,7 @@ class MILConfig(MethodConfig):
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
 def gradient(loss: Callable[..., jax.Array], theta: Params, *data: Any) -> Params:
-    """The gradient of loss(theta, *data), once more differentiable in theta (in reverse); `data` counts as constant.
+    """Differentiates loss(theta, *data); the result is differentiable in theta, in reverse; `data` is constant.
 
     Its derivative is a product of the Hessian with a vector. As the Hessian is symmetric (`loss` must not stop the
     gradient of a part of theta in one place and use it in another), the product may be taken forward over reverse,
@@ -132,7 +132,7 @@ class MIL(Method):
         return {"policy": self._steps(params, demo)[-1], "whitening": params["whitening"]}
 
     def _steps(self, params: Params, demo: Demo) -> list[Params]:
-        """The network's parameters before the inner steps and after each of them."""
+        """Takes the inner steps, and returns the network's parameters before them and after each."""
         theta, demo = params["policy"], shown(demo, self.config.given, params["whitening"])
         demo = self._with_goal_in_hindsight(params, demo)
         rates = jax.tree.map(lambda _: self.config.inner_lr, theta)
@@ -152,7 +152,7 @@ class MIL(Method):
         return thetas
 
     def _adapted(self, theta: Params) -> Params:
-        """Which tensors the inner step changes, a bool for each."""
+        """Tells which tensors the inner step changes, a bool for each."""
 
         def adapts(path: tuple, _: jax.Array) -> bool:
             names = {entry.key for entry in path}
@@ -164,13 +164,13 @@ class MIL(Method):
         return jax.tree_util.tree_map_with_path(adapts, theta)
 
     def unadapted(self, params: Params) -> Params:
-        """The parameters from which every task is learnt."""
+        """Returns the parameters from which every task is learned."""
         return {"policy": params["policy"], "whitening": params["whitening"]}
 
     def loss(
         self, params: Params, batch: TaskBatch, progress: jax.Array | float = 1.0
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """The meta-objective, averaged over the tasks; and its parts, [N] of each task.
+        """Computes the meta-objective, averaged over the tasks, and its parts, [N].
 
         With the variant "multi_step" it is sum over i = 1..n of w_i L(theta_i, d'), theta_i being the parameters after
         i of the n inner steps: w_i = (1 - progress) / n for i < n, and w_n is what they leave of 1 (Antoniou et al.
@@ -190,7 +190,7 @@ class MIL(Method):
         return loss.mean(), {"loss": loss, **metrics}
 
     def imitation(self, params: Params, batch: TaskBatch) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """L(theta, d) + L(theta, d'), without an inner step: d through the head of the inner loss, if it shows actions.
+        """Computes L(theta, d) + L(theta, d') without an inner step; d through the inner loss's head if it has actions.
 
         The policy learns what all tasks share, so that the first inner gradients point at what is special about one.
         """
@@ -205,7 +205,7 @@ class MIL(Method):
         return loss.mean(), {"loss": loss, **metrics}
 
     def _query_loss(self, params: Params, theta: Params, query: Demo) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """What parameters theta of the network lose on a task's queries, and the parts of it."""
+        """Computes the loss of parameters theta of the network on a task's queries, and its parts."""
         loss, metrics = self.imitation_loss(theta, params["whitening"], query)
         if self.network.hindsight is not None and query.goal is not None:
             whitening = jax.lax.stop_gradient(params["whitening"])
@@ -215,7 +215,7 @@ class MIL(Method):
         return loss, metrics
 
     def act(self, task_params: Params, observation: Observation, memory: Memory) -> tuple[jax.Array, Memory]:
-        """The adapted network's action for one observation. The memory is what a target head saw in the first one."""
+        """Chooses the adapted network's action. The memory is what a target head saw in the first observation."""
         whitening, batch = task_params["whitening"], jax.tree.map(lambda x: x[None], observation)
         target = memory[None] if self.network.has_target else None
         output = self.network.apply(task_params["policy"], batch.image, whitening.state(batch.state), 1, target)
@@ -223,7 +223,7 @@ class MIL(Method):
         return action, memory if output.target is None else output.target[0]
 
     def initial_memory(self, key: jax.Array) -> Memory:
-        """Nothing; for a target head the target [G], not known yet (NaN)."""
+        """Returns nothing; for a target head the target [G], not known yet (NaN)."""
         return jnp.full(len(self.goal_indices), jnp.nan) if self.network.has_target else ()
 
     def _inner_loss(self, theta: Params, whitening: Whitening, demo: Demo) -> jax.Array:
@@ -234,7 +234,7 @@ class MIL(Method):
         return loss + self.config.goal_weight * sum(head_losses(output, demo, whitening, self.goal_indices).values())
 
     def _with_goal_in_hindsight(self, params: Params, demo: Demo) -> Demo:
-        """Video alone gets a goal for its first image, as if given: the hindsight head's.
+        """Gives a video without states a goal for its first image: the hindsight head's.
 
         In training it is the first image that was drawn (`train.support_frames`), which may show the hand on its way.
         """
@@ -247,28 +247,28 @@ class MIL(Method):
         return dataclasses.replace(demo, goal=unknown.at[:, 0].set(goal))
 
     def _in_hindsight(self, theta: Params, whitening: Whitening, demo: Demo) -> Goal:
-        """Where the robot went in each of the demonstrations [K, T, ...], by their first and last images."""
+        """Predicts where the robot went in each of the demonstrations [K, T, ...], by their first and last images."""
         ends = jax.tree.map(lambda x: x[:, jnp.array([0, -1])], demo)
         maps = self._apply(theta, whitening, ends).feature_map
         assert self.network.hindsight is not None and maps is not None
         return self.network.hindsight(theta, maps.reshape(len(demo.state), 2, *maps.shape[1:]))
 
     def _apply(self, theta: Params, whitening: Whitening, demo: Demo) -> PolicyOutput:
-        """What the network says of all time steps of demonstrations [K, T, ...], one after the other."""
+        """Applies the network to all time steps of demonstrations [K, T, ...], one after the other."""
         seen = flat(demo)
         return self.network.apply(theta, seen.image, whitening.state(seen.state), demo.state.shape[1])
 
     def imitation_loss(
         self, theta: Params, whitening: Whitening, demo: Demo, inner: bool = False
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """Behavioural cloning (eq. 2) on demonstrations [K, T, ...], plus the goal head's error where there is one.
+        """Computes the imitation loss (eq. 2) on demonstrations [K, T, ...], plus that of a goal head if there is one.
 
         `inner` selects the head of the inner loss. Returns the sum and its parts.
         """
         whitening = jax.lax.stop_gradient(whitening)
         output = self._apply(theta, whitening, demo)
         action = output.inner_action if inner else output.action
-        return behavioural_cloning(self.config, output, action, demo, whitening, self.goal_indices)
+        return behavioral_cloning(self.config, output, action, demo, whitening, self.goal_indices)
 
 
 def make_mil(config: Config, spec: Spec) -> MIL:

@@ -21,13 +21,13 @@ class Random(Method):
     action_size: int
 
     def init(self, key: jax.Array, whitening: Whitening) -> Params:
-        """Nothing to learn."""
+        """Returns no parameters: there is nothing to learn."""
         return ()
 
     def loss(
         self, params: Params, batch: TaskBatch, progress: jax.Array | float = 1.0
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """Zero: nothing to learn."""
+        """Returns zero: there is nothing to learn."""
         return jnp.zeros(()), {"loss": jnp.zeros(len(batch.query.action))}
 
     def adapt(self, params: Params, demo: Demo) -> Params:
@@ -40,5 +40,5 @@ class Random(Method):
         return jax.random.normal(key, (self.action_size,)), next_key
 
     def initial_memory(self, key: jax.Array) -> Memory:
-        """The key of the episode's draws."""
+        """Returns the key of the episode's draws."""
         return key

@@ -38,7 +38,7 @@ class Whitening:
         return (action - self.action_mean) / self.action_scale
 
     def unwhiten_action(self, action: jax.Array) -> jax.Array:
-        """The inverse of `action`."""
+        """Inverts `action`."""
         return action * self.action_scale + self.action_mean
 
 

@@ -18,7 +18,7 @@ _HOPS = 2
 
 
 def separate_objects(state: jax.Array, object_indices: tuple[tuple[int, ...], ...]) -> tuple[jax.Array, jax.Array]:
-    """The objects' places [.., O, 2] and all other entries of states [.., S]."""
+    """Splits states [.., S] into the objects' positions [.., O, 2] and all other entries."""
     places = np.array(object_indices)
     rest = np.setdiff1d(np.arange(state.shape[-1]), places)
     return state[..., places], state[..., rest]

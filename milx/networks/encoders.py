@@ -64,7 +64,7 @@ class LastFrame(nn.Module):
 
     @nn.compact
     def __call__(self, image: jax.Array | None, state: jax.Array, action: jax.Array) -> jax.Array:
-        """See `ContextNetwork.encode`; the actions are not looked at."""
+        """Encodes as `ContextNetwork.encode` says; ignores the actions."""
         last = state[-1:]
         if image is not None:
             features = ConvStack(self.config, name="vision")(image[-1:], state.dtype)
@@ -82,7 +82,7 @@ class Recurrent(nn.Module):
 
     @nn.compact
     def __call__(self, image: jax.Array | None, state: jax.Array, action: jax.Array) -> jax.Array:
-        """See `ContextNetwork.encode`."""
+        """Encodes as `ContextNetwork.encode` says."""
         index = np.linspace(0, len(state) - 1, min(len(state), self.config.context_frames)).round().astype(int)
         parts = [state[index], action[index]]
         if image is not None:
@@ -102,7 +102,7 @@ class Actor(nn.Module):
 
     @nn.compact
     def __call__(self, context: jax.Array, image: jax.Array | None, state: jax.Array) -> PolicyOutput:
-        """See `ContextNetwork.apply`."""
+        """Acts as `ContextNetwork.apply` says."""
         features = query = None
         if image is not None:
             features = ConvStack(self.config, name="vision")(image, state.dtype)

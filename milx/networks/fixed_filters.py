@@ -1,7 +1,7 @@
 """A first convolution that is given and never learned (paper, Section 6.3): VGG-19's, or a bank of the training images.
 
 The bank is a usual one where no pretrained network is at hand (Coates, Ng and Lee 2011): patches of the training
-images are normalised and whitened, and the centres of their clusters become filters.
+images are normalized and whitened, and the centers of their clusters become filters.
 """
 
 import pathlib
@@ -35,9 +35,9 @@ class Filters(NamedTuple):
 
 
 def read_filters(path: str, config: NetworkConfig) -> Filters:
-    """VGG-19's first convolution from a .npz or .safetensors file with torchvision's names.
+    """Reads VGG-19's first convolution from a .npz or .safetensors file with torchvision's names.
 
-    The image's normalisation becomes part of it. At the border it sees black where VGG-19 sees grey.
+    The image's normalization becomes part of it. At the border it sees black where VGG-19 sees gray.
 
     Raises:
         ValueError: for a file of another kind, an array that is missing or of another shape, or layers of another size.
@@ -85,33 +85,33 @@ def cluster(images: np.ndarray, config: NetworkConfig) -> Filters:
     windows = np.lib.stride_tricks.sliding_window_view(images, (size, size), axis=(1, 2))
     index = [rng.integers(0, n, _PATCHES) for n in windows.shape[:3]]
     patches = windows[tuple(index)].transpose(0, 2, 3, 1).reshape(_PATCHES, -1) / 255.0
-    centred = patches - patches.mean(axis=1, keepdims=True)
-    spread = centred.std(axis=1, keepdims=True)
-    normal = (centred / np.sqrt(spread**2 + 1e-2))[spread[:, 0] > 1e-3]  # flat patches tell nothing
+    centered = patches - patches.mean(axis=1, keepdims=True)
+    spread = centered.std(axis=1, keepdims=True)
+    normal = (centered / np.sqrt(spread**2 + 1e-2))[spread[:, 0] > 1e-3]  # flat patches tell nothing
     mean = normal.mean(axis=0)
     value, vector = np.linalg.eigh(np.cov(normal.T))
     whiten = vector / np.sqrt(value + 0.1) @ vector.T
     white = (normal - mean) @ whiten
 
-    centres = rng.normal(size=(count, white.shape[1]))
+    centers = rng.normal(size=(count, white.shape[1]))
     for _ in range(ITERATIONS):
-        centres /= np.linalg.norm(centres, axis=1, keepdims=True)
-        score = white @ centres.T
+        centers /= np.linalg.norm(centers, axis=1, keepdims=True)
+        score = white @ centers.T
         nearest = score.argmax(axis=1)
-        centres = np.eye(count)[nearest].T @ (white * score.max(axis=1, keepdims=True))
-        empty = np.linalg.norm(centres, axis=1) < 1e-6
-        centres[empty] = white[rng.integers(0, len(white), empty.sum())]
-    centres /= np.linalg.norm(centres, axis=1, keepdims=True)
+        centers = np.eye(count)[nearest].T @ (white * score.max(axis=1, keepdims=True))
+        empty = np.linalg.norm(centers, axis=1) < 1e-6
+        centers[empty] = white[rng.integers(0, len(white), empty.sum())]
+    centers /= np.linalg.norm(centers, axis=1, keepdims=True)
 
-    weights = whiten @ centres.T
-    weights -= weights.mean(axis=0)  # as every patch is centred
-    scale = (centred @ weights).std(axis=0)
+    weights = whiten @ centers.T
+    weights -= weights.mean(axis=0)  # as every patch is centered
+    scale = (centered @ weights).std(axis=0)
     kernel = (weights / scale).reshape(size, size, 3, count)
     return Filters(kernel.astype(np.float32), np.zeros(count, np.float32))
 
 
 def put(params: Params, filters: Filters) -> Params:
-    """The parameters with the given filters in every fixed convolution."""
+    """Replaces the kernel of every fixed convolution in the parameters by the given filters."""
     values = {"fixed_kernel": filters.kernel, "fixed_bias": filters.bias}
 
     def replace(path: tuple, leaf: jax.Array) -> jax.Array:

@@ -44,7 +44,7 @@ class Goal(NamedTuple):
         return (jnp.exp(self.log_weight)[:, None] @ self.vote)[:, 0]
 
     def negative_log_likelihood(self, goal: jax.Array) -> jax.Array:
-        """[B] of goals [B, G]."""
+        """Computes [B] negative log-likelihoods of goals [B, G]."""
         size = self.vote.shape[-1]
         square = jnp.square(goal[:, None] - self.vote).sum(axis=-1)
         log_density = -0.5 * (square * jnp.exp(-2 * self.log_std) + size * jnp.log(2 * jnp.pi)) - size * self.log_std
@@ -62,16 +62,16 @@ class GoalHead(nn.Module):
 
     @nn.compact
     def __call__(self, features: jax.Array, query: jax.Array | None = None) -> Goal:
-        """`query` [B, C] is added to the filter."""
+        """Predicts as the class says; `query` [B, C] is added to the filter."""
         batch, height, width, channels = features.shape
         kernel = self.param("kernel", nn.initializers.normal(channels**-0.5), (channels,))
         features = features.reshape(batch, height * width, channels)
         heat = features @ kernel
         if query is not None:
             heat += jnp.einsum("bpc,bc->bp", features, query)
-        # The image reaches from -1 to 1: half a cell beyond the centres of the outermost.
-        centre = positions(height, width) * (1 - 1 / jnp.array([width, height]))
-        place = jnp.append(centre, jnp.ones((height * width, 1)), axis=-1)
+        # The image reaches from -1 to 1: half a cell beyond the centers of the outermost.
+        center = positions(height, width) * (1 - 1 / jnp.array([width, height]))
+        place = jnp.append(center, jnp.ones((height * width, 1)), axis=-1)
         vote = place @ self.param("vote", nn.initializers.zeros, (3, self.size))
         return Goal(jax.nn.log_softmax(heat), vote, self.param("log_std", nn.initializers.zeros, ()))
 
@@ -91,7 +91,7 @@ class StateGoalHead(nn.Module):
 
     @nn.compact
     def __call__(self, state: jax.Array, query: jax.Array | None = None) -> Goal:
-        """`query` [B, candidates] is added to the logarithms of the weights."""
+        """Predicts as the class says; `query` [B, candidates] is added to the logarithms of the weights."""
         heat = jnp.broadcast_to(
             self.param("heat", nn.initializers.zeros, (self.candidates,)), (len(state), self.candidates)
         )
@@ -115,13 +115,13 @@ class HindsightHead(nn.Module):
 
     @nn.compact
     def __call__(self, features: jax.Array) -> Goal:
-        """See the class."""
+        """Predicts as the class says."""
         both = jnp.concatenate([features[:, 0], features[:, -1]], axis=-1)
         return GoalHead(self.size, name="goal_head")(Dense(self.hidden, hidden=True)(both))
 
 
 def calibrate(params: Params, image_to_goal: jax.Array) -> Params:
-    """The parameters of a `GoalHead`, with votes from the camera's calibration.
+    """Initializes a `GoalHead` with votes from the camera's calibration, and returns its parameters.
 
     Args:
         params: the head's parameters.

@@ -18,7 +18,7 @@ def same_padding(size: int, kernel: int, stride: int) -> tuple[int, int]:
 
 
 def conv2d(x: jax.Array, kernel: jax.Array, stride: int) -> jax.Array:
-    """Two-dimensional convolution with SAME padding: on a CPU by patches, on accelerators by blocks.
+    """Convolves in two dimensions with SAME padding: on a CPU by patches, on accelerators by blocks.
 
     Args:
         x: [B, H, W, C].
@@ -33,7 +33,7 @@ def conv2d(x: jax.Array, kernel: jax.Array, stride: int) -> jax.Array:
 
 
 def convolve_patches(x: jax.Array, kernel: jax.Array, stride: int) -> jax.Array:
-    """`conv2d` with the fewest multiplications: every window of the image is copied, then multiplied by the kernel."""
+    """Computes `conv2d` with the fewest multiplications: copies every window, then multiplies it by the kernel."""
     taps, _, _, filters = kernel.shape
     height, width = x.shape[1:3]
     x = jnp.pad(x, ((0, 0), *(same_padding(size, taps, stride) for size in (height, width)), (0, 0)))
@@ -44,16 +44,16 @@ def convolve_patches(x: jax.Array, kernel: jax.Array, stride: int) -> jax.Array:
 
 
 def _product(x: jax.Array, weights: jax.Array) -> jax.Array:
-    """[.., K] times [K, F] as plain matrices: with more axes XLA copies the output's gradient into another order."""
+    """Multiplies [.., K] by [K, F] as plain matrices: with more axes XLA also copies the output's gradient."""
     return (x.reshape(-1, x.shape[-1]) @ weights).reshape(*x.shape[:-1], -1)
 
 
 def convolve_blocks(x: jax.Array, kernel: jax.Array, stride: int) -> jax.Array:
-    """`conv2d` with little traffic to memory and large matrix products.
+    """Computes `conv2d` with little traffic to memory and large matrix products.
 
-    The image is cut into blocks just large enough that a tile of outputs depends on 2 x 2 neighbouring blocks, and the
+    The image is cut into blocks just large enough that a tile of outputs depends on 2 x 2 neighboring blocks, and the
     kernel is spread over these four. Either the four are put side by side and multiplied at once, or each block is
-    multiplied by the weights of all four places and the products of neighbours are added: whichever moves less memory.
+    multiplied by the weights of all four places and the products of neighbors are added: whichever moves less memory.
     """
     taps, _, channels, filters = kernel.shape
     batch, *sizes, _ = x.shape
@@ -71,8 +71,8 @@ def convolve_blocks(x: jax.Array, kernel: jax.Array, stride: int) -> jax.Array:
     weights = _four_places(kernel, stride, tile)
     places = [(i, j) for i in range(2) for j in range(2)]
     if step * step * channels < tile * tile * filters:
-        neighbours = [blocks[:, i : i + rows, j : j + cols] for i, j in places]
-        y = _product(jnp.concatenate(neighbours, axis=-1), weights.reshape(-1, tile * tile * filters))
+        neighbors = [blocks[:, i : i + rows, j : j + cols] for i, j in places]
+        y = _product(jnp.concatenate(neighbors, axis=-1), weights.reshape(-1, tile * tile * filters))
     else:
         products = jnp.split(_product(blocks, jnp.concatenate(list(weights), axis=-1)), len(places), axis=-1)
         shifted = [z[:, i : i + rows, j : j + cols] for z, (i, j) in zip(products, places, strict=True)]
@@ -84,7 +84,7 @@ def convolve_blocks(x: jax.Array, kernel: jax.Array, stride: int) -> jax.Array:
 
 
 def _four_places(kernel: jax.Array, stride: int, tile: int) -> jax.Array:
-    """What a block in each of 2 x 2 places adds to a tile of outputs: four maps [step * step * C, tile * tile * F]."""
+    """Computes what blocks in 2 x 2 positions add to a tile of outputs: four maps [step² C, tile² F]."""
     taps, _, channels, filters = kernel.shape
     step = tile * stride
 
@@ -98,13 +98,13 @@ def _four_places(kernel: jax.Array, stride: int, tile: int) -> jax.Array:
 
 
 def positions(height: int, width: int) -> jax.Array:
-    """[H W, 2]: x and y in [-1, 1] of every position of a feature map, row by row."""
+    """Returns x and y in [-1, 1] of every position of a feature map, row by row: [H W, 2]."""
     y, x = jnp.meshgrid(jnp.linspace(-1, 1, height), jnp.linspace(-1, 1, width), indexing="ij")
     return jnp.stack([x.ravel(), y.ravel()], axis=-1)
 
 
 def spatial_soft_argmax(features: jax.Array, temperature: jax.Array) -> jax.Array:
-    """Expected image position of every channel (Levine et al. 2016, Section 5.1).
+    """Computes the expected image position of every channel (Levine et al. 2016, Section 5.1).
 
     Args:
         features: [B, H, W, C].
@@ -130,7 +130,7 @@ class SpatialSoftArgmax(nn.Module):
 
 
 def layer_norm(x: jax.Array) -> jax.Array:
-    """Zero mean and unit variance over all axes but the first; nothing learned."""
+    """Normalizes to zero mean and unit variance over all axes but the first; nothing is learned."""
     axes = tuple(range(1, x.ndim))
     # The variance as flax computes it, from sums that one pass over the input gives.
     mean, square = x.mean(axes, keepdims=True), jnp.square(x).mean(axes, keepdims=True)
@@ -140,7 +140,7 @@ def layer_norm(x: jax.Array) -> jax.Array:
 
 @jax.custom_vjp
 def add_bias(x: jax.Array, bias: jax.Array) -> jax.Array:
-    """[.., F] plus [F] in the bias's type, with the bias's gradient by `_sum_over_pixels`.
+    """Adds a bias [F] to [.., F] in the bias's type, and computes the bias's gradient by `_sum_over_pixels`.
 
     Like `shifted_relu`, it can be differentiated in reverse, and forward over reverse, but not forward alone.
     """
@@ -160,13 +160,13 @@ add_bias.defvjp(_add_bias_forward, _add_bias_backward)
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
-def shifted_relu(x: jax.Array, centre: jax.Array, dtype: jnp.dtype) -> jax.Array:
-    """relu([.., F] plus [F]) as `dtype`, with the centre's gradient by `_sum_over_pixels`."""
-    return nn.relu(x + centre).astype(dtype)
+def shifted_relu(x: jax.Array, center: jax.Array, dtype: jnp.dtype) -> jax.Array:
+    """Computes relu([.., F] plus [F]) as `dtype`, and the center's gradient by `_sum_over_pixels`."""
+    return nn.relu(x + center).astype(dtype)
 
 
-def _shifted_relu_forward(x: jax.Array, centre: jax.Array, dtype: jnp.dtype) -> tuple[jax.Array, tuple]:
-    y = nn.relu(x + centre).astype(dtype)
+def _shifted_relu_forward(x: jax.Array, center: jax.Array, dtype: jnp.dtype) -> tuple[jax.Array, tuple]:
+    y = nn.relu(x + center).astype(dtype)
     return y, (y, jnp.zeros((), x.dtype))
 
 
@@ -180,7 +180,7 @@ shifted_relu.defvjp(_shifted_relu_forward, _shifted_relu_backward)
 
 
 def _sum_over_pixels(x: jax.Array, dtype: jnp.dtype) -> jax.Array:
-    """[.., F] to [F]. On accelerators by a product with ones: XLA's own sum is slow where so few channels remain."""
+    """Sums [.., F] to [F]; on accelerators by a product with ones, since XLA's sum is slow for so few channels."""
     flat = x.reshape(-1, x.shape[-1])
     if jax.default_backend() == "cpu":
         return flat.sum(axis=0, dtype=dtype)
@@ -209,10 +209,10 @@ class ConvBlock(nn.Module):
         shape = (self.kernel, self.kernel, x.shape[-1], self.filters)
         kernel = self.param("kernel", nn.initializers.lecun_normal(), shape)
         bias = self.param("bias", nn.initializers.zeros, (self.filters,))
-        centre = self.param("centre", nn.initializers.zeros, (self.filters,))
+        center = self.param("centre", nn.initializers.zeros, (self.filters,))
         dtype = jnp.bfloat16 if self.mixed_precision else kernel.dtype
         x = conv2d(x.astype(dtype), kernel.astype(dtype), self.stride)
-        return shifted_relu(layer_norm(add_bias(x, bias)), centre, dtype)
+        return shifted_relu(layer_norm(add_bias(x, bias)), center, dtype)
 
 
 class FixedConv(nn.Module):

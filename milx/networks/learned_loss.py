@@ -24,7 +24,7 @@ class LearnedLoss(nn.Module):
 
     @nn.compact
     def __call__(self, features: jax.Array) -> jax.Array:
-        """See the class."""
+        """Computes the loss as the class says."""
         x, dtype = features, features.dtype
         if self.kind == "temporal":
             for _ in range(2):

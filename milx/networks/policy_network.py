@@ -95,7 +95,7 @@ class ConvStack(nn.Module):
 
     @nn.compact
     def __call__(self, image: jax.Array, dtype: jnp.dtype) -> jax.Array:
-        """`dtype` is that of the parameters."""
+        """Computes the features; `dtype` is that of the parameters."""
         config = self.config
         x = image.astype(dtype) / 255.0
         block = nn.remat(ConvBlock) if config.rematerialise else ConvBlock

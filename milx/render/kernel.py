@@ -46,28 +46,28 @@ def geom_table(
     materials: np.ndarray,
     texture: Textures | None,
 ) -> jax.Array:
-    """[G, 24] all that the kernel knows of every geom; with textures [G, 40].
+    """Returns [G, 24], all that the kernel must know of every geom; with textures [G, 40].
 
     Args:
         geom_type: [G] static, MuJoCo's geom types.
         geometry: the other arguments of `raycast.unit_maps`.
-        rgba: [G, 4] colours; where alpha is 0 the geom is passed over.
+        rgba: [G, 4] colors; where alpha is 0 the geom is passed over.
         materials: [G, 3] emission, specular and shininess.
         texture: [G] with frames that take the camera's, or none.
     """
     maps = raycast.unit_maps(geom_type, *geometry)
     geom_xpos, _, geom_size, cam_xpos, cam_xmat = geometry
-    centre = jnp.matmul(geom_xpos - cam_xpos, cam_xmat, precision=jax.lax.Precision.HIGHEST)
+    center = jnp.matmul(geom_xpos - cam_xpos, cam_xmat, precision=jax.lax.Precision.HIGHEST)
     radius = jnp.where(rgba[:, 3] > 0, bounding_radius(geom_type, geom_size), -jnp.inf)
     kinds = np.array([raycast.KIND_OF_GEOM.get(int(kind), -1) for kind in geom_type])
-    columns = [maps.affine.reshape(-1, 12), maps.stretch, centre, radius, kinds, rgba[:, :3], materials]
+    columns = [maps.affine.reshape(-1, 12), maps.stretch, center, radius, kinds, rgba[:, :3], materials]
     if texture is not None:
         columns += [texture.family, texture.rgb, texture.frame.reshape(-1, 12)]
     return jnp.column_stack([jnp.asarray(column, jnp.float32) for column in columns])
 
 
 def bounding_radius(geom_type: np.ndarray, geom_size: jax.Array) -> jax.Array:
-    """[G] m, of a ball around the centre of every geom; infinite for a plane, which may be."""
+    """Returns [G] radii in m of a ball around the center of every geom; infinite for a plane, which may be."""
     geom = mujoco.mjtGeom
     x, y, _ = geom_size.T
     radius_of = {
@@ -81,14 +81,14 @@ def bounding_radius(geom_type: np.ndarray, geom_size: jax.Array) -> jax.Array:
 
 
 def light_table(lights: shade.Lights) -> jax.Array:
-    """[L, 21] all lights, field by field."""
+    """Returns [L, 21], the fields of all lights one after the other."""
     return jnp.column_stack(lights).astype(jnp.float32)
 
 
 def paint(
     geoms: jax.Array, lights: jax.Array, ranges: dict[Kind, tuple[int, int]], view: View, interpret: bool = False
 ) -> jax.Array:
-    """The image [H, W, 3] uint8 of a scene without shadows.
+    """Draws a scene without shadows: an image [H, W, 3] uint8.
 
     Args:
         geoms: [G, ...] from `geom_table`, in any order that keeps each kind together.
@@ -124,7 +124,7 @@ def _paint_tile(geoms, lights, image, *, ranges, view) -> None:
         return tuple(tuple(geoms[geom, first + 4 * i + j] for j in range(4)) for i in range(3))
 
     def in_sight(geom):
-        """Whether the geom's ball reaches into the tile's pyramid, whose sides all contain the camera."""
+        """Tells whether the geom's ball reaches into the tile's pyramid, whose sides all contain the camera."""
         x, y, z, radius = (geoms[geom, _BALL + i] for i in range(4))
         sides = [(x + west * z, west), (-x - east * z, east), (-y - north * z, north), (y + south * z, south)]
         distances = [inside + _SLACK * radius * jnp.sqrt(1 + slope * slope) for inside, slope in sides]

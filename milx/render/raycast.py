@@ -65,7 +65,7 @@ class UnitMaps(NamedTuple):
 
 
 def dot(a: Vector, b: Vector) -> jax.Array:
-    """Inner product of two vectors."""
+    """Computes the inner product of two vectors."""
     total = a[0] * b[0]
     for x, y in zip(a[1:], b[1:], strict=True):
         total = total + x * y
@@ -102,12 +102,12 @@ def unit_maps(
 
 
 def rows_of(affine: jax.Array) -> tuple[Vector, ...]:
-    """An affine map [3, 4] as three rows of four scalars."""
+    """Splits an affine map [3, 4] into three rows of four scalars."""
     return tuple(tuple(row) for row in affine)
 
 
 def enter(kind: Kind, rows: tuple[Vector, ...], stretch: jax.Array, start: Vector | None, ray: Vector) -> jax.Array:
-    """Distance at which rays enter one geom, infinite if they do not.
+    """Computes the distance at which rays enter one geom; infinite if they do not.
 
     Args:
         kind: of the geom.
@@ -130,7 +130,7 @@ def _slab(o: jax.Array, d: jax.Array) -> tuple[jax.Array, jax.Array]:
 def _round(o: Vector, d: Vector) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Distances at which a ray enters and leaves the unit ball (the disc, given two coordinates), and whether it does.
 
-    Measured from the ray's closest point to the centre, which keeps float32 accurate for small shapes far away, where
+    Measured from the ray's closest point to the center, which keeps float32 accurate for small shapes far away, where
     the textbook discriminant cancels.
     """
     a = jnp.maximum(dot(d, d), _TINY)
@@ -142,31 +142,31 @@ def _round(o: Vector, d: Vector) -> tuple[jax.Array, jax.Array, jax.Array]:
 
 
 def _enter_plane(o: Vector, d: Vector, stretch: jax.Array) -> jax.Array:
-    """Distance to the front of the unit square."""
+    """Computes the distance to the front of the unit square."""
     t = -o[2] / jnp.minimum(d[2], -_TINY)
     hit = (d[2] < 0) & (jnp.abs(o[0] + t * d[0]) <= 1) & (jnp.abs(o[1] + t * d[1]) <= 1)
     return jnp.where(hit, t, jnp.inf)
 
 
 def _enter_ball(o: Vector, d: Vector, stretch: jax.Array) -> jax.Array:
-    """Distance to the unit ball."""
+    """Computes the distance to the unit ball."""
     t, _, hit = _round(o, d)
     return jnp.where(hit, t, jnp.inf)
 
 
 def _enter_capsule(o: Vector, d: Vector, stretch: jax.Array) -> jax.Array:
-    """Distance to the capsule: its first point lies on the ball around the nearest point of its axis.
+    """Computes the distance to the capsule: its first point lies on the ball around the nearest point of its axis.
 
     That point of the axis is level with the entry into the infinite cylinder, or the end beyond which the entry lies.
     """
     side, _, near = _round(o[:2], d[:2])
-    centre = jnp.clip(o[2] + side * d[2], -stretch, stretch)
-    t, _, hit = _round((o[0], o[1], o[2] - centre), d)
+    center = jnp.clip(o[2] + side * d[2], -stretch, stretch)
+    t, _, hit = _round((o[0], o[1], o[2] - center), d)
     return jnp.where(near & hit, t, jnp.inf)
 
 
 def _enter_cylinder(o: Vector, d: Vector, stretch: jax.Array) -> jax.Array:
-    """Distance to the cylinder, the part of an infinite cylinder within a slab."""
+    """Computes the distance to the cylinder, the part of an infinite cylinder that lies within a slab."""
     enter_side, leave_side, near = _round(o[:2], d[:2])
     enter_slab, leave_slab = _slab(o[2], d[2])
     t = jnp.maximum(enter_side, enter_slab)
@@ -174,7 +174,7 @@ def _enter_cylinder(o: Vector, d: Vector, stretch: jax.Array) -> jax.Array:
 
 
 def _enter_box(o: Vector, d: Vector, stretch: jax.Array) -> jax.Array:
-    """Distance to the box, the common part of three slabs."""
+    """Computes the distance to the box, the intersection of three slabs."""
     (x0, x1), (y0, y1), (z0, z1) = (_slab(o[i], d[i]) for i in range(3))
     t = jnp.maximum(jnp.maximum(x0, y0), z0)
     return jnp.where(t <= jnp.minimum(jnp.minimum(x1, y1), z1), t, jnp.inf)
@@ -190,14 +190,14 @@ _ENTER: Mapping[Kind, Callable[[Vector, Vector, jax.Array], jax.Array]] = {
 
 
 def _select(maps: UnitMaps, ids: np.ndarray) -> UnitMaps:
-    """The maps of some geoms."""
+    """Selects the maps of some geoms."""
     return UnitMaps(maps.affine[ids], maps.stretch[ids])
 
 
 def nearest(
     groups: Mapping[Kind, np.ndarray], maps: UnitMaps, visible: jax.Array, rays: Vector, near: float, far: float
 ) -> tuple[jax.Array, jax.Array]:
-    """The geom that each ray from the camera enters first.
+    """Finds the geom that each ray from the camera enters first.
 
     Bits of positive floats order as integers do. Distance and geom id therefore share one integer, the id in the lowest
     bits, and the search is a running minimum.
@@ -242,7 +242,7 @@ def blocked(
     ray: Vector,
     reach: jax.Array | float,
 ) -> jax.Array:
-    """Whether any geom stands in the way: [P] bool.
+    """Tells whether any geom stands in the way: [P] bool.
 
     Args:
         groups: static geom ids by kind.
@@ -265,7 +265,7 @@ def blocked(
 
 
 def normals(groups: Mapping[Kind, np.ndarray], maps: UnitMaps, geom_id: jax.Array, point: Vector) -> Vector:
-    """Unit normals of the surfaces, three [P] arrays in the camera frame.
+    """Computes the unit normals of the surfaces, three [P] arrays in the camera frame.
 
     Args:
         groups: static geom ids by kind.
@@ -282,7 +282,7 @@ def normals(groups: Mapping[Kind, np.ndarray], maps: UnitMaps, geom_id: jax.Arra
 
 
 def surface_normal(kind: jax.Array, rows: tuple[Vector, ...], stretch: jax.Array, point: Vector) -> Vector:
-    """Unit normals where points lie on geoms of these kinds and maps, all of them arrays over the points."""
+    """Computes unit normals at points on geoms of these kinds and maps, all of which are arrays over the points."""
     local = tuple(row[3] + dot(row[:3], point) for row in rows)
     gradient = _gradient(kind, stretch, local)
     normal = tuple(dot(column, gradient) for column in tuple(zip(*rows, strict=True))[:3])
@@ -291,14 +291,14 @@ def surface_normal(kind: jax.Array, rows: tuple[Vector, ...], stretch: jax.Array
 
 
 def _gradient(kind: jax.Array, stretch: jax.Array, point: Vector) -> Vector:
-    """Direction in which a unit shape's implicit function grows fastest, at a point of its surface."""
+    """Computes the direction in which a unit shape's implicit function grows fastest, at a point of its surface."""
     x, y, z = point
     # The faceted shapes: outwards on the face that the point is farthest out along.
     on_side = jnp.abs(z) < jnp.where(kind == Kind.BOX, jnp.maximum(jnp.abs(x), jnp.abs(y)), jnp.sqrt(x * x + y * y))
     skip_x = (kind == Kind.BOX) & (jnp.abs(x) < jnp.abs(y))
     skip_y = (kind == Kind.BOX) & ~skip_x
     faceted = (jnp.where(on_side & ~skip_x, x, 0.0), jnp.where(on_side & ~skip_y, y, 0.0), jnp.where(on_side, 0.0, z))
-    # The round shapes: away from the nearest point of the core, which is the centre or a capsule's axis.
+    # The round shapes: away from the nearest point of the core, which is the center or a capsule's axis.
     core = jnp.where(kind == Kind.CAPSULE, jnp.clip(z, -stretch, stretch), 0.0)
     solid = (jnp.where(kind >= Kind.CYLINDER, a, b) for a, b in zip(faceted, (x, y, z - core), strict=True))
     return tuple(jnp.where(kind == Kind.PLANE, a, b) for a, b in zip((0.0, 0.0, 1.0), solid, strict=True))

@@ -41,7 +41,7 @@ class Scene:
     light_ambient: jax.Array  # [L, 3]
     light_diffuse: jax.Array  # [L, 3]
     light_specular: jax.Array  # [L, 3]
-    headlight: jax.Array  # [3, 3] ambient, diffuse and specular colour of the light that shines along the view
+    headlight: jax.Array  # [3, 3] ambient, diffuse and specular color of the light that shines along the view
     texture: Textures | None = None  # [G] of every geom, with frames that take the world's; None for none
 
 
@@ -56,7 +56,7 @@ class Frame:
 
 
 def to_uint8(color: jax.Array) -> jax.Array:
-    """Colours in [0, 1] as uint8 in [0, 255], rounded."""
+    """Colors in [0, 1] as uint8 in [0, 255], rounded."""
     return jnp.round(255 * jnp.clip(color, 0.0, 1.0)).astype(jnp.uint8)
 
 
@@ -64,8 +64,8 @@ class Renderer:
     """Renders one camera of a model; pure functions to be used under `jax.jit` and `jax.vmap`.
 
     All geoms in groups 0 to 2 are rendered, as MuJoCo does by default. Near and far planes are MuJoCo's
-    (`visual/map/znear` and `zfar`, in units of the model's extent). The colour is differentiable with respect to the
-    colours and the lights; the geometry carries no gradient.
+    (`visual/map/znear` and `zfar`, in units of the model's extent). The color is differentiable with respect to the
+    colors and the lights; the geometry carries no gradient.
     """
 
     def __init__(
@@ -102,7 +102,7 @@ class Renderer:
         self._rays = (x.ravel(), y.ravel(), np.array(-1.0))
 
     def scene(self, data: mjx.Data | mujoco.MjData) -> Scene:
-        """The scene as the data has it: poses from the data; colours, sizes and lights from the model.
+        """Returns the scene that the data describes: poses from the data; colors, sizes and lights from the model.
 
         Args:
             data: a state after `kinematics`, `com_pos` and `camlight`, or after `forward` or `step`.
@@ -132,7 +132,7 @@ class Renderer:
         )
 
     def render(self, scene: Scene) -> Frame:
-        """The image of a scene."""
+        """Draws the image of a scene."""
         maps = raycast.unit_maps(self._model.geom_type, *_geometry(scene))
         visible = scene.geom_rgba[:, 3] > 0
         rays = tuple(jnp.asarray(ray, scene.geom_xpos.dtype) for ray in self._rays)
@@ -164,13 +164,13 @@ class Renderer:
         )
 
     def pixels(self, scene: Scene) -> jax.Array:
-        """The image alone, [H, W, 3] uint8, without gradients; on a GPU in one kernel, unless there are shadows."""
+        """Draws the image alone, [H, W, 3] uint8, without gradients; on a GPU in one kernel if no shadows fall."""
         if jax.default_backend() != "gpu" or self._shadows:
             return to_uint8(self.render(scene).color)
         return self.paint(scene)
 
     def paint(self, scene: Scene, interpret: bool = False) -> jax.Array:
-        """`pixels` in one kernel of a GPU, without shadows; `interpret` runs it anywhere, slowly."""
+        """Draws the image in one kernel of a GPU, without shadows; `interpret` runs the kernel anywhere, slowly."""
         texture = None if scene.texture is None else _in_camera(scene.texture, scene)
         geoms = kernel.geom_table(self._model.geom_type, _geometry(scene), scene.geom_rgba, self._materials, texture)
         order: list[int] = []
@@ -183,12 +183,12 @@ class Renderer:
         return kernel.paint(geoms[np.array(order)], lights, ranges, view, interpret)
 
     def _in_shadow(self, maps, visible, point, path, w) -> jax.Array:
-        """Whether a geom stands between the points and a light: [P] bool."""
+        """Tells whether a geom stands between the points and a light: [P] bool."""
         path = jax.lax.stop_gradient(path)
         return raycast.blocked(self._groups, maps, visible, point, path, jnp.where(w > 0, 1.0, self._far))
 
     def _lights(self, scene: Scene) -> dict[bool, shade.Lights]:
-        """The lights in the camera frame, by whether they throw shadows; the headlight is the last of those without."""
+        """Groups the lights, in the camera frame, by whether they cast shadows; the headlight, last, casts none."""
         model = self._model
         to_camera = jax.lax.stop_gradient(scene.cam_xmat).T
         directional = (model.light_type == _DIRECTIONAL)[:, None]
@@ -219,12 +219,12 @@ class Renderer:
 
 
 def _geometry(scene: Scene) -> tuple[jax.Array, ...]:
-    """Poses and sizes of the geoms, and the camera's pose, without gradients."""
+    """Returns the poses and sizes of the geoms and the camera's pose, without gradients."""
     return jax.lax.stop_gradient((scene.geom_xpos, scene.geom_xmat, scene.geom_size, scene.cam_xpos, scene.cam_xmat))
 
 
 def _in_camera(texture: Textures, scene: Scene) -> Textures:
-    """The textures with frames that take the camera's."""
+    """Expresses the textures' frames in the camera's."""
     pose = jax.lax.stop_gradient((scene.cam_xpos, scene.cam_xmat))
     return texture._replace(frame=textures.seen_from(jax.lax.stop_gradient(texture.frame), *pose))
 
@@ -235,7 +235,7 @@ def _rotate(matrix: jax.Array, vector: jax.Array) -> jax.Array:
 
 
 def _geom_rgba(model: mujoco.MjModel) -> np.ndarray:
-    """[G, 4] colours. As in MuJoCo a geom that keeps the default colour takes its material's."""
+    """Returns [G, 4] colors. As in MuJoCo, a geom that keeps the default color takes its material's."""
     rgba = np.array(model.geom_rgba)
     takes = (model.geom_matid >= 0) & np.all(rgba == np.array([0.5, 0.5, 0.5, 1.0]), axis=1)
     rgba[takes] = model.mat_rgba[model.geom_matid[takes]]
@@ -243,7 +243,7 @@ def _geom_rgba(model: mujoco.MjModel) -> np.ndarray:
 
 
 def _materials(model: mujoco.MjModel) -> np.ndarray:
-    """[G, 3] emission, specular and shininess; without a material MuJoCo's defaults."""
+    """Returns [G, 3] emission, specular and shininess; MuJoCo's defaults where there is no material."""
     values = np.tile([0.0, 0.5, 0.5], (model.ngeom, 1))
     has = model.geom_matid >= 0
     table = np.stack([model.mat_emission, model.mat_specular, model.mat_shininess], axis=1)
@@ -252,7 +252,7 @@ def _materials(model: mujoco.MjModel) -> np.ndarray:
 
 
 def _find_camera(model: mujoco.MjModel, camera: str | int) -> int:
-    """Id of a camera that this renderer can show.
+    """Finds the id of a camera that this renderer can show.
 
     Raises:
         ValueError: there is no such camera, or it is not given by `fovy` alone.

@@ -1,4 +1,4 @@
-"""Lighting: what colour a surface shows under MuJoCo's lights.
+"""Lighting: what color a surface shows under MuJoCo's lights.
 
 The model is that of MuJoCo's OpenGL renderer: emission, then for every light an ambient term, a diffuse term n.l and a
 Blinn-Phong specular term (n.h)^(128 shininess) with the half vector h between light and viewer, weakened with distance
@@ -40,20 +40,20 @@ class Lights(NamedTuple):
     exponent: jax.Array  # [L] of that cosine: 0 for any but spot lights
 
 
-def _normalise(v: Vector) -> tuple[Vector, jax.Array]:
-    """Unit vector and length."""
+def _normalize(v: Vector) -> tuple[Vector, jax.Array]:
+    """Divides a vector by its length, and returns both."""
     squared = jnp.maximum(dot(v, v), _SMALL)
     inverse = jax.lax.rsqrt(squared)
     return tuple(x * inverse for x in v), squared * inverse
 
 
 def _power(base: jax.Array, exponent: jax.Array) -> jax.Array:
-    """`base ** exponent` for a base in [0, 1], cut off just above zero."""
+    """Computes `base ** exponent` for a base in [0, 1], cut off just above zero."""
     return jnp.exp(exponent * jnp.log(jnp.maximum(base, _SMALL)))
 
 
 def emitted(material: Material) -> Vector:
-    """Colour without any light: three [P] arrays."""
+    """Computes the color without any light: three [P] arrays."""
     return tuple(material.emission * channel for channel in material.rgb)
 
 
@@ -64,7 +64,7 @@ def reflected(
     normal: Vector,
     blocked: Callable[[Vector, jax.Array], jax.Array] | None = None,
 ) -> Vector:
-    """Colour that lights add together.
+    """Sums the colors that the lights add.
 
     The lights are scanned, which also makes XLA compute each of the other arguments once: fused into the three channels
     of every light they would be computed again for each.
@@ -96,12 +96,12 @@ def reflect(
     normal: Vector,
     blocked: Callable[[Vector, jax.Array], jax.Array] | None = None,
 ) -> Vector:
-    """Colour that one light adds; `light` has no leading axis. For the rest see `reflected`."""
+    """Computes the color that one light adds; `light` has no leading axis. For the rest see `reflected`."""
     w = light.position[3]
     path = tuple(light.position[i] - w * point[i] for i in range(3))
-    to_light, distance = _normalise(path)
-    to_eye, _ = _normalise(tuple(-x for x in point))
-    half, _ = _normalise(tuple(a + b for a, b in zip(to_light, to_eye, strict=True)))
+    to_light, distance = _normalize(path)
+    to_eye, _ = _normalize(tuple(-x for x in point))
+    half, _ = _normalize(tuple(a + b for a, b in zip(to_light, to_eye, strict=True)))
 
     facing = dot(normal, to_light)
     diffuse = jnp.maximum(facing, 0.0)

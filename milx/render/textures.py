@@ -1,4 +1,4 @@
-"""Solid textures: at every point of a thing, how much it shows of a second colour.
+"""Solid textures: at every point of a thing, how much it shows of a second color.
 
 A texture is a function of the place in the thing's own frame, so that it turns with the thing and has no seams. Every
 family repeats with a period of about 1 in each direction; a texture's frame scales, turns and shifts it. What is held
@@ -26,7 +26,7 @@ class Textures(NamedTuple):
 
     Attributes:
         family: int32, index into FAMILIES.
-        rgb: [3] the second colour, in [0, 1].
+        rgb: [3] the second color, in [0, 1].
         frame: [3, 4] linear part and offset of the map from metres, in the thing's frame or the world's, to the
             family's units.
     """
@@ -37,17 +37,17 @@ class Textures(NamedTuple):
 
 
 def _wave(x: jax.Array) -> jax.Array:
-    """Of period 1, between -1 and 1."""
+    """Evaluates a wave of period 1 between -1 and 1."""
     return jnp.sin(_TURN * x)
 
 
 def _saw(x: jax.Array) -> jax.Array:
-    """Of period 1: distance from the nearest whole number, signed."""
+    """Computes the signed distance from the nearest whole number, of period 1."""
     return x - jnp.floor(x + 0.5)
 
 
 def _edge(x: jax.Array, sharpness: float) -> jax.Array:
-    """From 0 to 1 where x passes through 0."""
+    """Rises from 0 to 1 where x passes through 0."""
     return jnp.clip(0.5 + sharpness * x, 0.0, 1.0)
 
 
@@ -61,7 +61,7 @@ def _noise(p: Vector) -> jax.Array:
 
 
 def _bricks(p: Vector) -> jax.Array:
-    """Rows of 2 x 1, each shifted by half a brick, with joints of the second colour."""
+    """Rows of 2 x 1, each shifted by half a brick, with joints of the second color."""
     row = jnp.floor(p[1] + 0.5)
     joint = jnp.maximum(jnp.abs(_saw(p[1])), 2 * jnp.abs(_saw(p[0] / 2 + row / 2)) - 0.5)
     return _edge(joint - 0.38, 12)
@@ -80,18 +80,18 @@ FAMILIES: dict[str, Callable[[Vector], jax.Array]] = {
     "bricks": _bricks,
     "zigzag": lambda p: _edge(_wave(p[0] + 2 * jnp.abs(_saw(p[1] / 2))), 4),
 }
-"""How much of the second colour shows, in [0, 1], from places in the family's units."""
+"""How much of the second color shows, in [0, 1], from places in the family's units."""
 
 SPLITS: dict[str, tuple[str, ...]] = {
     "train": ("plain", "stripes", "checks", "dots", "noise", "marble"),
     "validation": ("waves", "plaid"),
     "test": ("rings", "bricks", "zigzag"),
 }
-"""The names of every split's families. From a family there are as many textures as there are frames and colours."""
+"""The names of every split's families. From a family there are as many textures as there are frames and colors."""
 
 
 def _draw_turn(key: jax.Array) -> jax.Array:
-    """A rotation matrix, all equally likely: two random vectors made orthonormal, and the third axis."""
+    """Samples a rotation matrix uniformly: makes two random vectors orthonormal and adds the third axis."""
     first, second = jax.random.normal(key, (2, 3))
     x = first / jnp.linalg.norm(first)
     normal = jnp.cross(x, second)
@@ -100,7 +100,7 @@ def _draw_turn(key: jax.Array) -> jax.Array:
 
 
 def draw(key: jax.Array, split: str) -> Textures:
-    """A texture of one of the families of a split (a key of SPLITS), of any size, turn, shift and colour."""
+    """Samples a texture of a split's (a key of SPLITS) families, with any size, rotation, shift and color."""
     names = list(FAMILIES)
     family_key, turn_key, period_key, shift_key, color_key = jax.random.split(key, 5)
     family = jax.random.choice(family_key, jnp.array([names.index(name) for name in SPLITS[split]]))
@@ -111,7 +111,7 @@ def draw(key: jax.Array, split: str) -> Textures:
 
 
 def seen_from(frame: jax.Array, xpos: jax.Array, xmat: jax.Array) -> jax.Array:
-    """The map for places in a frame whose origin is at `xpos` and whose axes are the columns of `xmat`: [..., 3, 4]."""
+    """Composes the map [..., 3, 4] for positions in a frame with origin `xpos` whose axes are the columns of `xmat`."""
     high = jax.lax.Precision.HIGHEST
     linear = jnp.matmul(frame[..., :3], xmat, precision=high)
     offset = jnp.einsum("...ij,...j->...i", frame[..., :3], xpos, precision=high) + frame[..., 3]
@@ -121,7 +121,7 @@ def seen_from(frame: jax.Array, xpos: jax.Array, xmat: jax.Array) -> jax.Array:
 def on_geoms(
     texture: Textures, body: np.ndarray, geom_bodyid: np.ndarray, xpos: jax.Array, xmat: jax.Array
 ) -> Textures:
-    """[G] textures of all geoms of a model, with frames that take the world's; geoms of other bodies are plain.
+    """Assigns textures to all G geoms of a model, with frames that take the world's; geoms of other bodies are plain.
 
     Args:
         texture: of some bodies, with frames that take the body's.
@@ -137,19 +137,19 @@ def on_geoms(
 
 
 def in_world(frame: jax.Array, xpos: jax.Array, xmat: jax.Array) -> jax.Array:
-    """The map for places in the world, where `frame` takes those of a body at this pose: [..., 3, 4]."""
+    """Composes the map for positions in the world, where `frame` takes those of a body at this pose: [..., 3, 4]."""
     back = jnp.swapaxes(xmat, -1, -2)
     origin = -jnp.einsum("...ij,...j->...i", back, xpos, precision=jax.lax.Precision.HIGHEST)
     return seen_from(frame, origin, back)
 
 
 def mix(rgb: Vector, family: jax.Array, second: Vector, rows: tuple[Vector, ...], point: Vector) -> Vector:
-    """The colour at each point, three [P] arrays.
+    """Computes the color at each point, three [P] arrays.
 
     Args:
-        rgb: first colour, three [P] arrays.
+        rgb: first color, three [P] arrays.
         family: [P], as any type of number.
-        second: second colour.
+        second: second color.
         rows: [3][4][P] map from the points to the family's units.
         point: three [P] arrays.
     """

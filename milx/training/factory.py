@@ -11,6 +11,6 @@ from milx.training.simulated import SimulatedRun
 
 
 def make_run(config: Config, workdir: str | pathlib.Path, console: Console | None = None) -> Run:
-    """A run on recorded demonstrations, or in the environment that `config.env_name` names."""
+    """Makes a run on recorded demonstrations, or in the environment that `config.env_name` names."""
     kind = RecordedRun if config.env_name == RECORDED else SimulatedRun
     return kind(config, workdir, console)

@@ -45,7 +45,7 @@ class MetricsWriter:
 
 
 def read_metrics(path: pathlib.Path) -> list[dict[str, Any]]:
-    """The lines of a metrics.jsonl file that are whole: a kill or a full disk may have left half a line."""
+    """Reads the lines of a metrics.jsonl file that are whole: a kill or a full disk may have left half a line."""
     lines = []
     for line in path.read_text().splitlines():
         with contextlib.suppress(ValueError):

@@ -32,7 +32,7 @@ RECORDED = "recorded"
 
 
 def make_config(path: str | pathlib.Path, method: str = "mil", preset: str = "fast", seed: int = 0) -> Config:
-    """The configuration of a preset for a data set: its image size, and no convolutions where there are no images.
+    """Configures a preset for a data set: its image size, and no convolutions where there are no images.
 
     Raises:
         ValueError: for a path that holds no data set, or a preset that does not exist.
@@ -48,7 +48,7 @@ def make_config(path: str | pathlib.Path, method: str = "mil", preset: str = "fa
 
 
 def spec_of(data: DataSet, config: Config) -> Spec:
-    """The sizes of what a policy sees and does on a data set."""
+    """Returns the sizes of what a policy sees and does on a data set."""
     head = data.header
     return Spec(head.image_shape, head.state_size, head.action_size, None, tuple(config.recorded.goal_indices))
 
@@ -61,7 +61,7 @@ class Statistics(NamedTuple):
 
 
 def read_vectors(data: DataSet, tasks: list[int], horizon: int) -> Statistics:
-    """All states and actions of these tasks, resampled to the horizon."""
+    """Reads all states and actions of these tasks, resampled to the horizon."""
     states, actions = [], []
     for task in tasks:
         info = data.header.tasks[task]
@@ -189,7 +189,7 @@ class RecordedRun(Run):
         )
 
     def _errors(self, params: Params, split: str) -> dict[str, float]:
-        """Mean squared errors over the tasks of a split, in standard deviations of the actions."""
+        """Computes mean squared errors over the tasks of a split, in standard deviations of the actions."""
         shots = self.config.evaluation.shots
         tasks = [i for i in self.data.header.of_split(split) if self._enough(i, shots)]
         action = self._vectors.action
@@ -210,7 +210,7 @@ class RecordedRun(Run):
         }
 
     def _task(self, task: int, shots: int) -> tuple[Recorded, Demo]:
-        """A task's queries [D, T, ...], and its first `shots` demonstrations that may be shown as the support."""
+        """Reads a task's queries [D, T, ...], and the first `shots` demonstrations that may be shown as the support."""
         info, horizon = self.data.header.tasks[task], self.config.recorded.horizon
         # Those without actions first, where they will do: the others are to be asked.
         numbers = sorted(range(len(info.lengths)), key=lambda i: info.has_action[i] and not self.given_action)

@@ -90,7 +90,7 @@ class Run(abc.ABC):
 
     @abc.abstractmethod
     def _load(self) -> Training:
-        """What to train on."""
+        """Loads what to train on."""
 
     @abc.abstractmethod
     def _shapes(self) -> Any:
@@ -98,18 +98,18 @@ class Run(abc.ABC):
 
     @abc.abstractmethod
     def _validate(self, params: Params) -> tuple[float, dict[str, float]]:
-        """How well the parameters do on validation tasks, and what `listening.measure` finds there."""
+        """Validates the parameters: their score on validation tasks, and what `listening.measure` finds there."""
 
     @abc.abstractmethod
     def _judge(self, params: Params) -> tuple[dict[str, Any], Callable[[dict[str, Any]], None]]:
-        """What the parameters reach on test tasks: fields of the result, and a function that draws the whole result."""
+        """Evaluates the parameters on test tasks: fields of the result, and a function that draws the whole result."""
 
     @abc.abstractmethod
     def report(self, result: dict[str, Any]) -> None:
         """Prints a result of `evaluate`."""
 
     def _precompile(self, params: Params) -> list[Callable[[], None]]:
-        """Other programs worth compiling in the background, from the shapes of the parameters."""
+        """Lists other programs worth compiling in the background, from the shapes of the parameters."""
         del params
         return []
 
@@ -223,7 +223,7 @@ class Run(abc.ABC):
         return compiled
 
     def _start(self, training: Training, checkpoints: Checkpoints) -> tuple[TrainState, jax.Array]:
-        """The state to train from, and the key of the batches."""
+        """Returns the state to train from, and the key of the batches."""
         state, batch_key = initial_state(self.trainer, self.config, training)
         if checkpoints.latest is not None:
             state, self.clock.seconds = restore_state(checkpoints, checkpoints.latest, state, training.dataset_hash)
@@ -245,7 +245,7 @@ class Run(abc.ABC):
 
     @contextlib.contextmanager
     def _progress(self, steps: int, done: int) -> Iterator[Callable[..., None]]:
-        """A bar on the console, and a function that updates it."""
+        """Shows a bar on the console, and yields a function that updates it."""
         columns = (
             TextColumn("{task.description}"),
             BarColumn(),

@@ -33,7 +33,7 @@ EVALUATION_SEED = 2017
 
 
 def demos_of_split(env: envs.Env, config: Config, split: str) -> DemoSet:
-    """The demonstrations of a split as a run uses them, planned or from the cache of earlier runs."""
+    """Returns the demonstrations of a split as a run uses them, planned or from the cache of earlier runs."""
     num_tasks, num_demos = {
         "train": (config.data.tasks, config.data.demos_per_task),
         "validation": (config.evaluation.validation_tasks, config.evaluation.shots + max(config.data.spare_demos, 1)),
@@ -50,7 +50,7 @@ def trial_key(split: str) -> jax.Array:
 
 
 def training_on(env: envs.Env, config: Config, train: DemoSet) -> Training:
-    """A run's view of planned demonstrations.
+    """Makes a run's view of planned demonstrations.
 
     Raises:
         ValueError: if no task has enough successful demonstrations for support and query.
@@ -78,7 +78,7 @@ def validation_of(
 def result_of(
     env: envs.Env, method: Method, params: Params, demos: DemoSet, config: Config, floors: closed_loop.Floors
 ) -> tuple[Trials, dict[str, Any]]:
-    """The trials of the test tasks, and what the result file says of them."""
+    """Evaluates on the test tasks: the trials, and what the result file says of them."""
     trials = closed_loop.run_trials(env, method, params, demos, config.evaluation, trial_key("test"))
     misled = closed_loop.run_trials(env, method, params, demos, config.evaluation, trial_key("test"), misled=True)
     return trials, closed_loop.summarize(env, config, demos.task, trials, misled, floors)
@@ -114,7 +114,7 @@ class SimulatedRun(Run):
         super().__init__(config, self.env.spec, sample, self.env.chain, workdir, console)
 
     def demos(self, split: str) -> DemoSet:
-        """The demonstrations of a split, planned or from the cache of earlier runs."""
+        """Returns the demonstrations of a split, planned or from the cache of earlier runs."""
         with self.clock("demos"), self.console.status(f"planning {split} demonstrations"):
             demos = demos_of_split(self.env, self.config, split)
         count, success = demos.success.size, float(demos.success.mean())

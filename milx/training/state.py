@@ -40,7 +40,7 @@ def check_steps(config: Config) -> None:
 
 
 def initial_state(trainer: Trainer, config: Config, training: Training) -> tuple[TrainState, jax.Array]:
-    """The state before the first meta-update on these demonstrations, and the key of the batches."""
+    """Makes the state before the first meta-update on these demonstrations, and the key of the batches."""
     init_key, batch_key = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), 3))
     state = trainer.init(init_key, training.whitening)
     if config.network.fixed_filters is None:
@@ -76,7 +76,7 @@ def save_state(
 def restore_state(
     checkpoints: Checkpoints, step: int, state: TrainState, dataset_hash: str
 ) -> tuple[TrainState, dict[str, float]]:
-    """The state of a checkpoint, and the seconds spent until then.
+    """Restores the state of a checkpoint, and the seconds spent until then.
 
     Args:
         checkpoints: of the run.

@@ -45,7 +45,7 @@ class TrainState:
 
 
 def make_optimizer(config: OptimizerConfig, steps: int) -> optax.GradientTransformation:
-    """Adam with the configured schedule over `steps` meta-updates, after clipping the global norm."""
+    """Makes Adam with the configured schedule over `steps` meta-updates, after clipping the global norm."""
     peak, warmup = config.learning_rate, round(config.warmup * steps)
     then = optax.cosine_decay_schedule(peak, steps - warmup) if config.cosine else optax.constant_schedule(peak)
     rate = optax.join_schedules([optax.linear_schedule(0.0, peak, max(warmup, 1)), then], [warmup])
@@ -58,7 +58,7 @@ Loss = Callable[[Params, TaskBatch], tuple[jax.Array, dict[str, jax.Array]]]
 
 
 def meta_gradient(loss: Loss, params: Params, batch: TaskBatch) -> tuple[Params, dict[str, jax.Array]]:
-    """The gradient of a loss, and its metrics, [N] of each task.
+    """Computes the gradient of a loss, and its metrics, [N] of each task.
 
     A CPU works on a few tasks at a time, so that what they need stays in its cache.
 
@@ -100,12 +100,12 @@ class Trainer:
 
     @functools.partial(jax.jit, static_argnums=0)
     def init(self, key: jax.Array, whitening: Whitening) -> TrainState:
-        """The state before the first meta-update."""
+        """Makes the state before the first meta-update."""
         params = self.method.init(key, whitening)
         return TrainState(jnp.zeros((), jnp.int32), params, self.optimizer.init(params))
 
     def update(self, state: TrainState, data: Any, key: jax.Array) -> tuple[TrainState, dict[str, jax.Array]]:
-        """One meta-update on the batch of (key, state.step), unless its loss or its gradient is not finite.
+        """Makes one meta-update on the batch of (key, state.step), unless its loss or its gradient is not finite.
 
         Returns:
             The next state, and the metrics' means over the tasks; "skipped" is 1 where the parameters stayed as they
@@ -135,11 +135,11 @@ class Trainer:
         return TrainState(state.step + 1, params, optimizer), metrics
 
     def _keys(self, key: jax.Array, step: jax.Array) -> jax.Array:
-        """[N] which draw the batch of a step."""
+        """Splits the keys [N] that draw the batch of a step."""
         return jax.random.split(jax.random.fold_in(key, step), self.train.meta_batch)
 
     def _gradient(self, params: Params, batch: TaskBatch, step: jax.Array) -> tuple[Params, dict[str, jax.Array]]:
-        """That of plain imitation for the first updates, if so configured, and of the meta-objective after them."""
+        """Computes the gradient of plain imitation for the first updates, if configured, then of the meta-objective."""
         first = self.method.imitation_steps
 
         def meta_objective(params: Params, batch: TaskBatch) -> tuple[jax.Array, dict[str, jax.Array]]:

@@ -1,1 +1,1 @@
-"""Trajectory optimisation: the planner that demonstrates the tasks."""
+"""Trajectory optimization: the planner that demonstrates the tasks."""

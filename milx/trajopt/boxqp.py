@@ -13,7 +13,7 @@ _STEP_SIZES = (1.0, 0.5, 0.25, 0.1, 0.01, 0.001)
 
 
 class Solution(NamedTuple):
-    """Minimiser of a box-constrained quadratic program.
+    """Minimizer of a box-constrained quadratic program.
 
     Attributes:
         x: [m], inside the box.
@@ -27,7 +27,7 @@ class Solution(NamedTuple):
 def solve(
     H: jax.Array, g: jax.Array, low: jax.Array, high: jax.Array, start: jax.Array, *, iterations: int = 6
 ) -> Solution:
-    """Minimises ½ xᵀHx + gᵀx subject to low ≤ x ≤ high by projected Newton steps.
+    """Minimizes ½ xᵀHx + gᵀx subject to low ≤ x ≤ high by projected Newton steps.
 
     Each step moves along the Newton direction of the dimensions that no bound holds back, projected onto the box, as
     in Tassa, Mansard & Todorov 2014. Of a few step sizes the best is taken instead of the first that suffices.

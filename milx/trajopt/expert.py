@@ -41,7 +41,7 @@ Feedback = Callable[[State, jax.Array], jax.Array]
 
 
 def follow(plan: Plan) -> Feedback:
-    """The plan's linear feedback."""
+    """Makes the feedback that follows a plan linearly."""
     return lambda state, t: plan.actions[t] + plan.gains[t] @ (state.vector - plan.states[t])
 
 
@@ -99,7 +99,7 @@ def perform(
 
 
 def choose_tactics(env: Env, task: Task, state: State) -> np.ndarray:
-    """[N] the first tactic with which the controller succeeds in a rehearsal of each of N scenes, without noise.
+    """Finds, for each of N scenes, the first tactic [N] with which the controller succeeds without noise.
 
     Where no tactic succeeds it is the first of all.
     """

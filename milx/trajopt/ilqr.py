@@ -2,7 +2,7 @@
 
 The problem: over T steps from a given x_0, with states x in R^n and actions u in R^m,
 
-    minimise    J = Σ_{t<T} ½ |r(x_t, u_t, t)|² + ½ |r_T(x_T)|²
+    minimize    J = Σ_{t<T} ½ |r(x_t, u_t, t)|² + ½ |r_T(x_T)|²
     subject to  x_{t+1} = f(x_t, u_t)  and  low ≤ u_t ≤ high.
 
 One iteration improves a plan (x̄, ū). With A = f_x, B = f_u, r_x and r_u taken along the plan and a prime for the next
@@ -14,13 +14,13 @@ step, the backward pass begins at V_x = r_T,xᵀ r_T, V_xx = r_T,xᵀ r_T,x and 
     V_x = Sᵀ (r + r_u k) + Fᵀ (V_x' + V_xx' B k)        V_xx = SᵀS + Fᵀ V_xx' F    with  F = A + B K,  S = r_x + r_u K.
 
 The forward pass rolls out u = ū + α k + K (x - x̄) with several step sizes α at once and keeps the cheapest plan. The
-regularisation μ holds new states near the old ones: it grows when no step size lowers the cost and shrinks when one
+regularization μ holds new states near the old ones: it grows when no step size lowers the cost and shrinks when one
 does. Costs written as residuals have Gauss-Newton Hessians: V_xx, a sum of squares, is never indefinite, and nothing
 asks for second derivatives of f or for reverse mode, which MJX lacks.
 
 References:
     Tassa, Erez & Todorov, "Synthesis and stabilization of complex behaviors through online trajectory optimization",
-        IROS 2012: the backward pass with its improved regularisation and value update, the schedule of μ.
+        IROS 2012: the backward pass with its improved regularization and value update, the schedule of μ.
     Tassa, Mansard & Todorov, "Control-limited differential dynamic programming", ICRA 2014: the limits (box-DDP).
 """
 
@@ -89,21 +89,21 @@ class Options:
         step_sizes: the α that are tried together, none above 1.
         sufficient_decrease: the fraction of the expected decrease that an accepted step must reach.
         tolerance: converged once an iteration lowers the cost, or expects to, by no more than this fraction of it.
-        regularisation: the first μ. Too small a one lets the first step leap into a poor local minimum. Convergence is
+        regularization: the first μ. Too small a one lets the first step leap into a poor local minimum. Convergence is
             not judged above it, where steps are short by force.
-        regularisation_min: the smallest μ other than zero.
-        regularisation_max: the solver gives up above this μ.
-        regularisation_factor: Δ_0, by which the growth rate of μ rises at each failure and falls at each success.
+        regularization_min: the smallest μ other than zero.
+        regularization_max: the solver gives up above this μ.
+        regularization_factor: Δ_0, by which the growth rate of μ rises at each failure and falls at each success.
     """
 
     iterations: int = 50
     step_sizes: tuple[float, ...] = (1.0, 0.5, 0.2, 0.05)
     sufficient_decrease: float = 1e-3
     tolerance: float = 1e-5
-    regularisation: float = 1.0
-    regularisation_min: float = 1e-6
-    regularisation_max: float = 1e8
-    regularisation_factor: float = 1.6
+    regularization: float = 1.0
+    regularization_min: float = 1e-6
+    regularization_max: float = 1e8
+    regularization_factor: float = 1.6
 
 
 class _Policy(NamedTuple):
@@ -128,7 +128,7 @@ class _Search(NamedTuple):
 
 
 def _backward(problem: Problem, states: jax.Array, actions: jax.Array, mu: jax.Array) -> _Policy:
-    """The policy that improves a plan: the recursion at the head of this file, from the last step to the first.
+    """Improves a plan's policy by the recursion at the head of this file, from the last step to the first.
 
     Where the linear model is not finite, k and K are zero and ΔV is NaN, so that no line search can succeed.
     """
@@ -185,8 +185,8 @@ def _forward(
 
 
 def _schedule(mu: jax.Array, delta: jax.Array, success: jax.Array, options: Options) -> tuple[jax.Array, jax.Array]:
-    """The quadratic schedule of Tassa et al. 2012: in a run of equal outcomes, mu changes faster and faster."""
-    factor, least = options.regularisation_factor, options.regularisation_min
+    """Updates mu by the quadratic schedule of Tassa et al. 2012, ever faster in a run of equal outcomes."""
+    factor, least = options.regularization_factor, options.regularization_min
     delta = jnp.where(success, jnp.minimum(1 / factor, delta / factor), jnp.maximum(factor, delta * factor))
     mu = mu * delta
     return jnp.where(success, jnp.where(mu < least, 0.0, mu), jnp.maximum(mu, least)), delta
@@ -227,11 +227,11 @@ def solve(problem: Problem, initial_state: jax.Array, actions: jax.Array, option
         policy = _backward(problem, states, actions, mu)
         negligible = options.tolerance * cost
         done = (success & (search.cost - cost <= negligible)) | (-policy.change.sum() <= negligible)
-        converged = done & (mu <= options.regularisation) & jnp.isfinite(cost)
+        converged = done & (mu <= options.regularization) & jnp.isfinite(cost)
         return _Search(states, actions, cost, policy, mu, delta, search.iterations + 1, converged)
 
     def unfinished(search: _Search) -> jax.Array:
-        return ~search.converged & (search.iterations < options.iterations) & (search.mu <= options.regularisation_max)
+        return ~search.converged & (search.iterations < options.iterations) & (search.mu <= options.regularization_max)
 
     # Pass 0 of the loop, not counted, rolls out the initial actions and finds their policy. So the dynamics, slow to
     # compile, appear only twice in the program. As pass 0 counts as a success, μ starts one factor higher.
@@ -241,7 +241,7 @@ def solve(problem: Problem, initial_state: jax.Array, actions: jax.Array, option
         actions=jnp.clip(actions.astype(dtype), low, high),
         cost=jnp.asarray(jnp.inf, dtype),
         policy=_Policy(jnp.zeros((T, m), dtype), jnp.zeros((T, m, n), dtype), jnp.zeros(2, dtype)),
-        mu=jnp.asarray(options.regularisation * options.regularisation_factor, dtype),
+        mu=jnp.asarray(options.regularization * options.regularization_factor, dtype),
         delta=jnp.ones((), dtype),
         iterations=jnp.asarray(-1, jnp.int32),
         converged=jnp.asarray(False),

@@ -48,7 +48,7 @@ def test_nothing_is_wrong_with_a_good_set(tmp_path):
         (lambda tasks: tasks[0][1].pop(), "task 'task 0' has 1 demonstration: one more must be the query"),
         (
             lambda tasks: tasks.__setitem__(0, ("train", [dataclasses.replace(d, action=None) for d in tasks[0][1]])),
-            "task 'task 0' shows no actions: it cannot be learnt from",
+            "task 'task 0' shows no actions: it cannot be learned from",
         ),
         (lambda tasks: tasks[1][1].append(good(31)), "lengths from 10 to 31 steps"),
         (lambda tasks: tasks[2][1].append(with_column(good(), "state", 1, np.nan)), "state: 10 values are not finite"),
@@ -64,7 +64,7 @@ def test_nothing_is_wrong_with_a_good_set(tmp_path):
             lambda tasks: tasks[0][1].__setitem__(
                 0, dataclasses.replace(good(), image=np.full((10, 8, 8, 3), 7, np.uint8))
             ),
-            "task 'task 0': the first image is of one colour",
+            "task 'task 0': the first image is of one color",
         ),
     ],
 )

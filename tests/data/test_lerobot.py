@@ -62,7 +62,7 @@ def test_every_episode_is_read_as_it_was_written(camera):
         demo = episode.read()
         np.testing.assert_array_equal(demo.state, state)
         np.testing.assert_array_equal(demo.action, action)
-        # Video is lossy, and worst where the halves meet; neighbouring steps differ by 15.
+        # Video is lossy, and worst where the halves meet; neighboring steps differ by 15.
         error = np.abs(demo.image.astype(int) - image)
         assert error[:, :, [5, -5]].max() < (7 if camera == TOP else 1)
 
@@ -86,7 +86,7 @@ def test_an_import_is_a_data_set(tmp_path):
     problems = " ".join(check.problems(data))
     assert "state[3] is constant" in problems
     assert "action[2] is constant" in problems
-    assert "first image is of one colour" in problems, "that of the first episode"
+    assert "first image is of one color" in problems, "that of the first episode"
 
 
 def test_files_or_a_mapping_make_tasks(tmp_path):

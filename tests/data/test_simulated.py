@@ -171,7 +171,7 @@ def test_demonstrations_that_diverge_are_dropped_and_counted(trained, monkeypatc
     np.testing.assert_array_equal(demos.action[~demos.success], 0)
 
 
-def test_sets_of_the_splits_share_no_colour(trained):
+def test_sets_of_the_splits_share_no_color(trained):
     colors = [
         np.asarray(getattr(trained, split).task.object_color).reshape(-1, 3)
         for split in ("train", "validation", "test")
@@ -279,7 +279,7 @@ def test_only_successful_demonstrations_are_drawn(trained):
         assert drawn[2:].min() > 0
 
 
-def test_a_redrawn_batch_shows_the_same_demonstrations_in_new_colours_and_places(trained):
+def test_a_redrawn_batch_shows_the_same_demonstrations_in_new_colors_and_places(trained):
     env, keys = trained.run.env, jax.random.split(jax.random.key(6), 3)
     batches = [
         jax.jit(lambda keys, redraw=redraw: demos_lib.sample_batch(env, trained.train, keys, 1, 2, 2, redraw))(keys)
@@ -292,7 +292,7 @@ def test_a_redrawn_batch_shows_the_same_demonstrations_in_new_colours_and_places
         changed = np.abs(a.image.astype(int) - b.image.astype(int)).max(axis=-1) > 2
         # Three cubes of 0.06 m in an arena of 0.6 m cover 3% of it, in the old places and the new ones.
         assert 0.005 < changed.mean() < 0.1
-    # Support and query of a task show the same three new colours: the brightest red of the cubes agrees.
+    # Support and query of a task show the same three new colors: the brightest red of the cubes agrees.
     seen = [np.asarray(d.image, int) for d in (redrawn.support, redrawn.query)]
     other = [np.asarray(d.image, int) for d in (plain.support, plain.query)]
     for n in range(3):

@@ -26,7 +26,7 @@ def task(env):
 
 
 def test_the_image_is_that_of_the_tasks_own_model(env, task):
-    """Geoms, sizes and colours of things without a texture, from C MuJoCo's poses; what is not used is not seen."""
+    """Geoms, sizes and colors of things without a texture, from C MuJoCo's poses; what is not used is not seen."""
     task = dataclasses.replace(task, texture=task.texture._replace(family=jnp.zeros(4, jnp.int32)))
     state = env.reset(jax.random.key(5), task)
     model, ours = copy.copy(env.mj_model), env.model_of(task)
@@ -39,7 +39,7 @@ def test_the_image_is_that_of_the_tasks_own_model(env, task):
     mujoco.mj_forward(model, data)
     renderer = Renderer(model, env.camera, *env.image_shape)
     frame = jax.jit(renderer.render)(renderer.scene(data))
-    # Rounding moves a silhouette by a hair: a pixel in a thousand may show its neighbour.
+    # Rounding moves a silhouette by a hair: a pixel in a thousand may show its neighbor.
     off = np.abs(env.render(task, state).astype(int) - to_uint8(frame.color).astype(int)).max(axis=-1)
     assert (off > 1).mean() < 2e-3
     visible = set(np.unique(frame.geom_id))
@@ -87,7 +87,7 @@ def test_the_state_is_that_of_mujocos_arm(env):
 
 
 def test_calibration_tells_where_in_the_image_a_container_stands(env, task):
-    """The target's pixels, found by drawing it in another colour, have their centre where the calibration puts it."""
+    """The target's pixels, found by drawing it in another color, have their center where the calibration puts it."""
     plain = dataclasses.replace(task, texture=task.texture._replace(family=jnp.zeros(4, jnp.int32)))
     looks = [dataclasses.replace(plain, color=plain.color.at[1].set(level)) for level in (0.1, 0.9)]
     render, state = jax.jit(env.render), env.reset(jax.random.key(9), task)
@@ -97,8 +97,8 @@ def test_calibration_tells_where_in_the_image_a_container_stands(env, task):
         dark, light = (np.asarray(render(look, dataclasses.replace(state, mocap_pos=away)), int) for look in looks)
         rows, cols = np.nonzero(np.abs(light - dark).max(axis=-1) > 40)
         height, width = env.image_shape
-        centre = np.array([(2 * cols.mean() + 1) / width - 1, (2 * rows.mean() + 1) / height - 1, 1.0])
-        errors.append(np.linalg.norm(centre @ env.image_to_goal - spot))
+        center = np.array([(2 * cols.mean() + 1) / width - 1, (2 * rows.mean() + 1) / height - 1, 1.0])
+        errors.append(np.linalg.norm(center @ env.image_to_goal - spot))
     # Half a pixel is 8 mm; the camera looks down at an angle, which an affine map fits to a few centimetres.
     assert np.median(errors) < 0.02
     assert max(errors) < 0.05

@@ -128,7 +128,7 @@ def test_the_controller_pushes_most_objects_to_the_goal_in_spite_of_noise(env, s
     assert jax.jit(jax.vmap(env.success))(tasks, states).mean() > 0.9
 
 
-def test_a_tactic_is_how_far_to_the_side_of_the_objects_centre_the_hand_meets_it(env, shown, monkeypatch):
+def test_a_tactic_is_how_far_to_the_side_of_the_objects_center_the_hand_meets_it(env, shown, monkeypatch):
     """To the left, as the hand looks at the goal. Of 32 means, on an arm shaken by noise, 4 mm are three deviations."""
     tasks, _, _ = shown
     scenes, keys = scenes_of(env, tasks)
@@ -186,7 +186,7 @@ def test_the_hand_starts_low_enough_for_every_shape(env, task):
 
 
 def test_the_image_is_that_of_the_tasks_own_model(env, task):
-    """Geoms, sizes and colours of things without a texture; what is not used is not seen."""
+    """Geoms, sizes and colors of things without a texture; what is not used is not seen."""
     task = dataclasses.replace(task, texture=task.texture._replace(family=jnp.zeros(2, jnp.int32)))
     model = c_model(env, task)
     model.geom_rgba[:] = env.colors(task)

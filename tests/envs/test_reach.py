@@ -234,16 +234,16 @@ def test_the_image_shows_cubes_and_fingertip_where_they_are():
         along = np.linspace(0, 1, 20)[:, None]
         arm = np.concatenate([along * elbow, elbow + along * (robot[i, 4:6] - elbow)])
         for cube in range(3):
-            centre = np.asarray(states.mocap_pos[i, cube])
-            if np.linalg.norm(arm - centre[:2], axis=-1).min() < 0.06:
+            center = np.asarray(states.mocap_pos[i, cube])
+            if np.linalg.norm(arm - center[:2], axis=-1).min() < 0.06:
                 continue  # the arm, above the cubes, may hide this one
-            row, column = pixel([*centre[:2], 0.06])
+            row, column = pixel([*center[:2], 0.06])
             color = image[i, row, column]
             cosine = color @ primaries[i, cube] / np.linalg.norm(color)
             assert cosine > 0.98, f"scene {i}, cube {cube}: {color}"
             targets_seen += cube == int(tasks.target[i])
-            # 7 cm from its centre the cube has ended.
-            away = [*(centre[:2] - 0.07 * np.sign(centre[:2]) * [1, 0]), 0.0]
+            # 7 cm from its center the cube has ended.
+            away = [*(center[:2] - 0.07 * np.sign(center[:2]) * [1, 0]), 0.0]
             others = np.delete(np.asarray(states.mocap_pos[i, :, :2]), cube, axis=0)
             if np.abs(others - away[:2]).max(axis=-1).min() > 0.06:
                 color = image[i, *pixel(away)]

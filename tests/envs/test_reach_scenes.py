@@ -1,4 +1,4 @@
-"""What reach draws: colours of the splits, scenes and their distances, and where the camera sees them."""
+"""What reach draws: colors of the splits, scenes and their distances, and where the camera sees them."""
 
 import dataclasses
 
@@ -49,7 +49,7 @@ def assert_uniform(counts):
     np.testing.assert_allclose(counts, n * p, atol=4 * np.sqrt(n * p * (1 - p)))
 
 
-def test_splits_draw_colours_from_disjoint_grids(tasks):
+def test_splits_draw_colors_from_disjoint_grids(tasks):
     seen = {}
     for split, offset in {"train": 0, "validation": 25, "test": 50}.items():
         color = np.asarray(tasks[split].object_color)
@@ -60,13 +60,13 @@ def test_splits_draw_colours_from_disjoint_grids(tasks):
             for channel in range(3):
                 assert_uniform(np.unique(thousandths[:, cube, channel], return_counts=True)[1])
         seen[split] = {tuple(rgb) for rgb in thousandths.reshape(-1, 3)}
-        assert len(seen[split]) > 990, "12,000 draws of 1,000 colours"
+        assert len(seen[split]) > 990, "12,000 draws of 1,000 colors"
     assert not seen["train"] & seen["test"]
     assert not seen["train"] & seen["validation"]
     assert not seen["validation"] & seen["test"]
 
 
-def test_a_task_has_three_colours_and_any_cube_as_target(tasks):
+def test_a_task_has_three_colors_and_any_cube_as_target(tasks):
     for drawn in tasks.values():
         color = np.asarray(drawn.object_color)
         gap = np.abs(color[:, [0, 0, 1]] - color[:, [1, 2, 2]]).max(axis=-1)
@@ -74,7 +74,7 @@ def test_a_task_has_three_colours_and_any_cube_as_target(tasks):
         assert_uniform(np.bincount(drawn.target, minlength=3))
 
 
-def test_a_redrawn_task_keeps_its_target_and_has_other_training_colours(env, tasks):
+def test_a_redrawn_task_keeps_its_target_and_has_other_training_colors(env, tasks):
     keys = jax.random.split(jax.random.key(5), 4000)
     redrawn = jax.jit(jax.vmap(env.redraw_appearance))(keys, tasks["train"])
     np.testing.assert_array_equal(redrawn.target, tasks["train"].target)
@@ -82,7 +82,7 @@ def test_a_redrawn_task_keeps_its_target_and_has_other_training_colours(env, tas
     np.testing.assert_allclose(colors, np.round(colors, 1), atol=1e-6)  # the training grid is that of whole tenths
     assert_uniform(np.bincount(np.round(colors * 10).astype(int).ravel(), minlength=10))
     assert np.abs(colors[:, [0, 0, 1]] - colors[:, [1, 2, 2]]).max(axis=-1).min() > 0.09
-    # A cube keeps its colour with probability 1/1000.
+    # A cube keeps its color with probability 1/1000.
     kept = (np.abs(colors - tasks["train"].object_color).max(axis=-1) < 1e-6).sum()
     assert kept < 12 + 4 * np.sqrt(12)
 
@@ -111,7 +111,7 @@ def test_a_redrawn_scene_moves_only_the_distractors_to_where_reset_would_put_the
 
 
 def test_calibration_tells_where_in_the_image_a_cube_stands(env):
-    """The cube's pixels, found by drawing it in another colour, have their centre where the calibration puts it."""
+    """The cube's pixels, found by drawing it in another color, have their center where the calibration puts it."""
     spots = np.random.default_rng(0).uniform(-0.19, 0.19, (6, 2))
     image_to_goal = env.image_to_goal
     for spot in spots:
@@ -121,9 +121,9 @@ def test_calibration_tells_where_in_the_image_a_cube_stands(env):
         dark, light = (np.asarray(env.observe(t, state).image, int) for t in task)
         rows, cols = np.nonzero(np.abs(light - dark).max(axis=-1) > 60)
         height, width = env.image_shape
-        centre = np.array([(2 * cols.mean() + 1) / width - 1, (2 * rows.mean() + 1) / height - 1, 1.0])
+        center = np.array([(2 * cols.mean() + 1) / width - 1, (2 * rows.mean() + 1) / height - 1, 1.0])
         # Half a pixel is 4 mm; a cube of 6 cm, seen from 1.2 m, shows a little of its sides.
-        np.testing.assert_allclose(centre @ image_to_goal, spot, atol=0.008)
+        np.testing.assert_allclose(center @ image_to_goal, spot, atol=0.008)
 
 
 def test_scenes_keep_their_distances_and_the_arm_starts_at_zero(env, task):

@@ -42,7 +42,7 @@ def test_stick_has_the_area_and_gyration_of_a_rectangle_with_two_half_discs():
     found = to_geoms(shape(Capsule(0, 0, length * 0.6, length * 0.8, radius)))
     disc, rectangle = np.pi * radius**2, 2 * radius * length
     unit = np.sqrt((length / 2 + radius) * np.sqrt((disc + rectangle) / np.pi))
-    # Half discs: their centres of mass lie 4 r / 3 pi beyond the ends.
+    # Half discs: their centers of mass lie 4 r / 3 pi beyond the ends.
     shift = 4 * radius / (3 * np.pi)
     discs = disc * (radius**2 / 2 - shift**2 + (length / 2 + shift) ** 2)
     gyration = (discs + rectangle * (length**2 + 4 * radius**2) / 12) / (disc + rectangle)
@@ -51,7 +51,7 @@ def test_stick_has_the_area_and_gyration_of_a_rectangle_with_two_half_discs():
 
 
 @pytest.mark.parametrize("name", SHAPES)
-def test_every_shape_is_centred_and_what_is_only_seen_stands_on_its_outline(name):
+def test_every_shape_is_centered_and_what_is_only_seen_stands_on_its_outline(name):
     found = to_geoms(SHAPES[name])
     ends, radius = outline(found)
     points = np.random.default_rng(0).uniform(-3, 3, (40_000, 2))

@@ -164,7 +164,7 @@ def test_the_context_tells_the_goal_head_what_to_look_for(name, vision):
     goals = [goal(jax.tree.map(lambda x, k=k: x[k], demos)) for k in range(2)]
     assert jnp.abs(jnp.exp(goals[0].log_weight) - jnp.exp(goals[1].log_weight)).max() > 1e-3
     np.testing.assert_array_equal(goals[0].vote, goals[1].vote)
-    if vision:  # centres of the four by five cells, through the calibration
+    if vision:  # centers of the four by five cells, through the calibration
         x, y = np.meshgrid([-0.8, -0.4, 0, 0.4, 0.8], [-0.75, -0.25, 0.25, 0.75])
         expected = np.stack([0.5 * x.ravel() + 0.1, -0.5 * y.ravel() + 0.2], axis=-1)
         np.testing.assert_allclose(goals[0].vote, expected, atol=1e-6)

@@ -94,16 +94,16 @@ def test_policies_with_a_memory_act_step_by_step(case, tmp_path):
         alone = standalone.Policy(tmp_path / "out")
         one = {"image": np.asarray(demo.image[0]), "state": np.asarray(demo.state[0], np.float32)}
         shown = one | {"action": np.asarray(demo.action[0], np.float32)}
-        learnt = policy.adapt(policy.params, Demo(**shown)), alone.adapt(**shown)
-        expected = replay(method, learnt[0], Demo(**jax.tree.map(jnp.asarray, one)))
+        learned = policy.adapt(policy.params, Demo(**shown)), alone.adapt(**shown)
+        expected = replay(method, learned[0], Demo(**jax.tree.map(jnp.asarray, one)))
         with pytest.raises(ValueError, match=r"memory: missing, expected `Policy\.step`"):
-            policy.act(learnt[0], Observation(one["image"][0], one["state"][0]))
+            policy.act(learned[0], Observation(one["image"][0], one["state"][0]))
         with pytest.raises(ValueError, match="memory: missing, expected `step`"):
-            alone.act(learnt[1], image=one["image"][0], state=one["state"][0])
+            alone.act(learned[1], image=one["image"][0], state=one["state"][0])
         memories, found = [policy.initial_memory, alone.initial_memory], []
         for image, state in zip(one["image"], one["state"], strict=True):
-            first, memories[0] = policy.step(learnt[0], Observation(image, state), memories[0])
-            second, memories[1] = alone.step(learnt[1], memories[1], image=image, state=state)
+            first, memories[0] = policy.step(learned[0], Observation(image, state), memories[0])
+            second, memories[1] = alone.step(learned[1], memories[1], image=image, state=state)
             found.append((first, second))
         for each in zip(*found, strict=True):
             np.testing.assert_allclose(np.stack(each), expected, atol=1e-5)

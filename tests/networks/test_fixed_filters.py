@@ -30,7 +30,7 @@ def write(path, weight=WEIGHT, **more):
 
 
 @pytest.mark.parametrize("kind", ["npz", "safetensors"])
-def test_vggs_layer_sees_the_normalised_image(kind, tmp_path):
+def test_vggs_layer_sees_the_normalized_image(kind, tmp_path):
     """SciPy's correlation of the image as VGG-19 wants it, away from the border."""
     filters = fixed_filters.read_filters(write(tmp_path / f"vgg.{kind}", other=np.zeros(2)), CONFIG)
     image = RNG.uniform(size=(12, 14, 3))
@@ -71,7 +71,7 @@ def scene(seed):
 def test_the_bank_answers_to_what_the_images_show_and_not_to_brightness():
     config = dataclasses.replace(CONFIG, filters=(12, 4))
     filters = fixed_filters.cluster(scene(0), config)
-    assert np.abs(filters.kernel.sum(axis=(0, 1, 2))).max() < 1e-4  # a flat grey patch gives nothing
+    assert np.abs(filters.kernel.sum(axis=(0, 1, 2))).max() < 1e-4  # a flat gray patch gives nothing
     windows = np.lib.stride_tricks.sliding_window_view(scene(1) / 255.0, (3, 3), axis=(1, 2))
     windows = windows[:, :22, :22].transpose(0, 1, 2, 4, 5, 3).reshape(-1, 27)
     answers = windows @ filters.kernel.reshape(27, -1)

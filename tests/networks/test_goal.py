@@ -48,7 +48,7 @@ def test_gradient_in_the_filter_is_the_mean_feature_less_the_feature_where_the_g
 
 
 def test_gradient_in_the_weights_of_states_votes_is_their_prior_less_their_posterior(rng):
-    """Each state has its own votes, all states share their weights; from equal weights a step favours what was near."""
+    """Each state has its own votes, all states share their weights; from equal weights a step favors what was near."""
     state, goal = rng.standard_normal((BATCH, 7)), rng.standard_normal((BATCH, GOAL))
     head = StateGoalHead(GOAL)
     params = head.init(jax.random.key(0), jnp.asarray(state))["params"]
@@ -80,7 +80,7 @@ def test_votes_are_affine_in_the_position_and_the_weights_follow_the_features(rn
     found = head.apply({"params": params}, jnp.asarray(features))
     x, y = 2 * spot[1] / (WIDTH - 1) - 1, 2 * spot[0] / (HEIGHT - 1) - 1
     np.testing.assert_allclose(positions(HEIGHT, WIDTH)[spot[0] * WIDTH + spot[1]], [x, y], rtol=1e-12)
-    x, y = (2 * spot[1] + 1) / WIDTH - 1, (2 * spot[0] + 1) / HEIGHT - 1  # the cell's centre in the image
+    x, y = (2 * spot[1] + 1) / WIDTH - 1, (2 * spot[0] + 1) / HEIGHT - 1  # the cell's center in the image
     # e^54 against eleven positions without features.
     np.testing.assert_allclose(found.mean[0], np.array([x, y, 1.0]) @ params["vote"], rtol=1e-12)
 

@@ -140,7 +140,7 @@ def test_layer_norm_of_a_constant_image_is_zero_and_has_finite_gradients():
     assert np.isfinite(gradient).all()
 
 
-# Bias and centre: derivatives of their own, which must be those that JAX finds.
+# Bias and center: derivatives of their own, which must be those that JAX finds.
 
 
 @pytest.mark.parametrize("by_product", [False, True])
@@ -151,7 +151,7 @@ def test_layer_norm_of_a_constant_image_is_zero_and_has_finite_gradients():
         (lambda x, shift: layers.shifted_relu(x, shift, x.dtype), lambda x, shift: jax.nn.relu(x + shift)),
     ],
 )
-def test_derivatives_of_bias_and_centre(rng, monkeypatch, by_product, written, plain):
+def test_derivatives_of_bias_and_center(rng, monkeypatch, by_product, written, plain):
     if by_product:
         monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     inputs = jnp.asarray(rng.standard_normal((2, 3, 4, 5))), jnp.asarray(rng.standard_normal(5))
@@ -173,5 +173,5 @@ def test_gradients_of_bfloat16_images_are_summed_in_float32(monkeypatch, by_prod
     expected = np.full(3, 4096 * float(jnp.bfloat16(weight)))
     bias = jax.grad(lambda bias: weight * layers.add_bias(x.astype(jnp.bfloat16), bias).sum())(jnp.zeros(3))
     np.testing.assert_allclose(bias, expected, rtol=1e-6)
-    centre = jax.grad(lambda centre: (weight * layers.shifted_relu(x, centre, jnp.bfloat16).astype(float)).sum())
-    np.testing.assert_allclose(centre(jnp.zeros(3)), expected, rtol=1e-6)
+    center = jax.grad(lambda center: (weight * layers.shifted_relu(x, center, jnp.bfloat16).astype(float)).sum())
+    np.testing.assert_allclose(center(jnp.zeros(3)), expected, rtol=1e-6)

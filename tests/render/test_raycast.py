@@ -12,7 +12,7 @@ from milx.render import Renderer
 
 HEIGHT, WIDTH = 48, 60
 CAMERA = '<camera name="eye" pos="0 -1.8 1.1" xyaxes="1 0 0 0 .5 .85" fovy="48"/>'
-# One light per colour channel, from the side of the camera: on white geoms the colour then tells the normal.
+# One light per color channel, from the side of the camera: on white geoms the color then tells the normal.
 TO_LIGHTS = np.array([[0.0, -1.0, 0.0], [0.6, 0.0, 0.8], [-0.6, 0.0, 0.8]])
 SOLIDS = ("sphere", "capsule", "ellipsoid", "cylinder", "box")
 
@@ -80,7 +80,7 @@ def test_agrees_with_mujoco_rays_on_random_scenes():
         np.testing.assert_allclose(np.asarray(frames.depth[k])[hit], depth[hit], rtol=2e-5)
         assert np.isinf(np.asarray(frames.depth[k])[same & (geom_id < 0)]).all()
         wrong = np.abs(np.asarray(frames.color[k]) - np.maximum(normal @ TO_LIGHTS.T, 0)).max(axis=-1) > 5e-3
-        # A pixel on the edge of a box or a cylinder may show the neighbouring face.
+        # A pixel on the edge of a box or a cylinder may show the neighboring face.
         assert wrong[hit].mean() <= 0.002, f"scene {k}: normals differ on {wrong[hit].mean():.2%}"
         seen_types |= {int(model.geom_type[i]) for i in np.unique(geom_id[hit])}
     assert len(seen_types) == 6, "the scenes must show every primitive, or the comparison is idle"
@@ -102,7 +102,7 @@ def test_sphere_on_the_axis_has_the_radius_of_its_tangent_cone(one_sphere):
     frame = render(dataclasses.replace(scene, geom_xpos=(scene.cam_xpos - distance * scene.cam_xmat[:, 2])[None]))
     pixels = np.tan(np.arcsin(radius / distance)) / np.tan(np.deg2rad(48) / 2) * HEIGHT / 2
     covered = np.asarray(frame.geom_id) == 0
-    # Pixel centres inside a circle: their number differs from its area by about the root of the circumference.
+    # Pixel centers inside a circle: their number differs from its area by about the root of the circumference.
     np.testing.assert_allclose(covered.sum(), np.pi * pixels**2, atol=np.sqrt(2 * np.pi * pixels))
     np.testing.assert_allclose(np.argwhere(covered).mean(axis=0), [(HEIGHT - 1) / 2, (WIDTH - 1) / 2], atol=1e-6)
     np.testing.assert_allclose(np.asarray(frame.depth)[covered].min(), distance - radius, rtol=1e-3)

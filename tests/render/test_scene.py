@@ -62,7 +62,7 @@ def test_mjx_poses_of_cameras_and_lights_on_bodies_are_mujocos(model, data):
         np.testing.assert_allclose(np.asarray(getattr(scene, field)), expected, atol=1e-6, err_msg=field)
 
 
-def test_colours_and_materials_are_those_that_mujoco_draws(model, data):
+def test_colors_and_materials_are_those_that_mujoco_draws(model, data):
     drawn = mujoco.MjvScene(model, maxgeom=20)
     mujoco.mjv_updateScene(model, data, mujoco.MjvOption(), None, mujoco.MjvCamera(), mujoco.mjtCatBit.mjCAT_ALL, drawn)
     geoms = {g.objid: g for g in drawn.geoms[: drawn.ngeom] if g.objtype == mujoco.mjtObj.mjOBJ_GEOM}

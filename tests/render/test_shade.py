@@ -81,16 +81,16 @@ def test_spot_light_has_a_cone_and_weakens_with_distance():
 
 @pytest.mark.parametrize("kind", ["directional", "point"])
 def test_the_shadow_of_a_sphere_lies_where_geometry_says(kind):
-    centre, radius, place = np.array([0.3, 0.2, 0.5]), 0.2, np.array([0.9, 0.5, 1.6])
+    center, radius, place = np.array([0.3, 0.2, 0.5]), 0.2, np.array([0.9, 0.5, 1.6])
     lights = f'<light type="{kind}" pos="{place[0]} {place[1]} {place[2]}" dir="{-place[0]} {-place[1]} {-place[2]}"/>'
-    geoms = f'<geom type="sphere" size="{radius}" pos="{centre[0]} {centre[1]} {centre[2]}"/>'
+    geoms = f'<geom type="sphere" size="{radius}" pos="{center[0]} {center[1]} {center[2]}"/>'
     render, scene = build(lights, geoms, shadows=True)
     frame = render(scene)
     points = floor_points()
     ray = np.broadcast_to(place, points.shape) if kind == "directional" else place - points
     ray = ray / np.linalg.norm(ray, axis=-1, keepdims=True)
-    # A floor point is in shadow when the line to its light passes the centre closer than the radius.
-    off = centre - points
+    # A floor point is in shadow when the line to its light passes the center closer than the radius.
+    off = center - points
     passes = np.linalg.norm(off - (off * ray).sum(-1, keepdims=True) * ray, axis=-1)
     floor = (np.asarray(frame.geom_id) == 0) & (np.abs(passes - radius) > 1e-4)
     dark = (np.asarray(frame.color) == 0).all(axis=-1)
@@ -111,7 +111,7 @@ def test_shadows_leave_a_lit_convex_geom_alone():
 
 @pytest.fixture(scope="module")
 def lively():
-    """Mean colour of a scene with solids, shadows, background and two kinds of light, as a function of the scene."""
+    """Mean color of a scene with solids, shadows, background and two kinds of light, as a function of the scene."""
     render, scene = build(
         '<light type="directional" dir="-.3 .2 -1" diffuse=".5 .5 .5"/>'
         '<light type="spot" pos=".4 .4 1.5" dir="-.2 -.2 -1" ambient=".1 .1 .1" castshadow="false"/>',
@@ -126,7 +126,7 @@ def lively():
     return jax.jit(lambda s: jnp.mean(weights * render(s).color)), scene
 
 
-# Colours enter linearly, so a long step costs nothing; poses enter smoothly where the shadow's edge is left alone.
+# Colors enter linearly, so a long step costs nothing; poses enter smoothly where the shadow's edge is left alone.
 @pytest.mark.parametrize(
     ("field", "rows", "step", "rtol"),
     [

@@ -43,7 +43,7 @@ def test_regular_families_repeat(name):
 
 
 @pytest.mark.parametrize("name", NAMES[1:])
-def test_both_colours_show_on_a_thing(name):
+def test_both_colors_show_on_a_thing(name):
     """Over a ball as large as a small object, in the largest period."""
     rng = np.random.default_rng(0)
     place = rng.normal(size=(3, 4000))

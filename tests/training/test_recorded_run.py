@@ -30,7 +30,7 @@ MEAN, SPREAD = np.array([3.0, -1.0]), np.array([2.0, 0.1])
 
 
 def random_demo(rng, direction, length):
-    """Images of a task's colour; actions along its direction, and on the state."""
+    """Images of a task's color; actions along its direction, and on the state."""
     state = rng.normal(size=(length, 3)).astype(np.float32)
     color = np.uint8(128 + 100 * np.append(direction, 0.0))
     image = np.broadcast_to(color, (length, 12, 16, 3))
@@ -68,7 +68,7 @@ def trained(cache, folder, tmp_path_factory):
     return run, run.evaluate()
 
 
-def test_held_out_tasks_are_learnt_from_their_demonstration(trained):
+def test_held_out_tasks_are_learned_from_their_demonstration(trained):
     """The direction is the task; its share of the actions' variance is 1.5^2/2 of 1.5^2/2 + 0.5^2."""
     run, result = trained
     errors = result["action_error"]

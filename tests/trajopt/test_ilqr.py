@@ -100,7 +100,7 @@ def stacked_lqs(lqs):
 
 
 def test_one_iteration_solves_lq_as_riccati_does(lqs, stacked_lqs):
-    plans = solve_lq(stacked_lqs, np.inf, ilqr.Options(regularisation=0.0))
+    plans = solve_lq(stacked_lqs, np.inf, ilqr.Options(regularization=0.0))
     np.testing.assert_array_equal(plans.iterations, 1)
     assert plans.converged.all()
     for i, lq in enumerate(lqs):
@@ -228,9 +228,9 @@ def swing_ups():
 
 
 def test_cost_never_rises():
-    # Without regularisation the full step, the only one here, at times makes things worse: then the plan stays.
+    # Without regularization the full step, the only one here, at times makes things worse: then the plan stays.
     def cost_after(iterations):
-        options = ilqr.Options(iterations=iterations, step_sizes=(1.0,), regularisation=0.0)
+        options = ilqr.Options(iterations=iterations, step_sizes=(1.0,), regularization=0.0)
         return ilqr.solve(pendulum_problem(), jnp.asarray(STARTS[0]), jnp.asarray(GUESS), options).cost
 
     costs = np.asarray(jax.jit(jax.vmap(cost_after))(jnp.arange(40)))

@@ -143,7 +143,7 @@ class Geoms(NamedTuple):
 
 
 def to_geoms(container: Container) -> Geoms:
-    """The geoms of a container.
+    """Builds the geoms of a container.
 
     Raises:
         ValueError: for a number of sides or handles that there are no geoms for.

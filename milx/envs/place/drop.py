@@ -66,7 +66,7 @@ class Drop:
     def model_of(
         self, thing: Geoms, unit: jax.Array, container: containers.Geoms, width: jax.Array, place: jax.Array
     ) -> mjx.Model:
-        """The model with a thing and a container.
+        """Builds the model with a thing and a container.
 
         Args:
             thing: its geoms, as it hangs from the hand: below z = 0, which is where it is held.
@@ -91,7 +91,7 @@ class Drop:
         )
 
     def start(self, thing: Geoms, unit: jax.Array, tip: jax.Array, turn: jax.Array) -> Fall:
-        """The thing at rest, held at `tip` [3] (m) with axes `turn` [3, 3] (columns)."""
+        """Holds the thing at rest at `tip` [3] (m) with axes `turn` [3, 3] (columns)."""
         middle = tip + turn[:, 2] * unit * _middle(thing)
         quat = jnp.roll(Rotation.from_matrix(turn).as_quat(), 1)
         return Fall(jnp.concatenate([middle, quat]), jnp.zeros(6))
@@ -107,7 +107,7 @@ class Drop:
         tip: jax.Array,
         turn: jax.Array,
     ) -> tuple[Fall, Fall]:
-        """The thing SECONDS after it was let go, and in all time steps before, with a leading axis.
+        """Lets the thing fall for SECONDS, and returns its last state and those of all time steps, with a leading axis.
 
         For the arguments see `model_of` and `start`.
         """
@@ -120,13 +120,13 @@ class Drop:
         return jax.lax.scan(step, self.start(thing, unit, tip, turn), length=round(SECONDS / TIMESTEP))
 
     def held_at(self, thing: Geoms, unit: jax.Array, fall: Fall) -> tuple[jax.Array, Rotation]:
-        """Where the point is by which the thing was held [3] (m), and how the thing is turned: `start`'s inverse."""
+        """Computes where the thing was held [3] (m) and how it is turned: the inverse of `start`."""
         turn = Rotation.from_quat(jnp.roll(fall.qpos[3:], -1))
         return fall.qpos[:3] - turn.as_matrix()[:, 2] * unit * _middle(thing), turn
 
 
 def _middle(thing: Geoms) -> jax.Array:
-    """Height of the first capsule's axis, in the thing's unit of length: its centre of mass is there."""
+    """Returns the height of the first capsule's axis, where the center of mass is, in the thing's unit of length."""
     return thing.pos[0, 2]
 
 

@@ -140,7 +140,7 @@ class Place(Env):
         )
 
     def redraw_appearance(self, key: jax.Array, task: PlaceTask) -> PlaceTask:
-        """The same thing and containers in other colours and textures."""
+        """Gives the same thing and containers other colors and textures."""
         return dataclasses.replace(task, **_draw_looks(key, "train"))
 
     def reset(self, key: jax.Array, task: PlaceTask) -> State:
@@ -152,14 +152,14 @@ class Place(Env):
         return State(jnp.array(_START) + noise, jnp.zeros(NUM_JOINTS), jnp.concatenate([place, ground], axis=-1))
 
     def redraw_scene(self, key: jax.Array, task: PlaceTask, states: State) -> State:
-        """The same motion to the same place, with the two other containers elsewhere."""
+        """Keeps the motion and the target, and moves the two other containers elsewhere."""
         target = states.mocap_pos[0, task.target, :2]
         place = _first_spaced(_draw_places(key).at[:, task.target].set(target))
         return dataclasses.replace(states, mocap_pos=states.mocap_pos.at[..., :2].set(place))
 
     @functools.partial(jax.jit, static_argnums=0)
     def hand(self, qpos: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Position [3] of the tip (m), axes [3, 3] of the hand as columns, and the Jacobian [6, 7] of its motion."""
+        """Returns the tip's position [3] (m), the hand's axes [3, 3] as columns, and its motion's Jacobian [6, 7]."""
         data = mjx.kinematics(self.model, self._data.replace(qpos=qpos))
         tip, axis = data.site_xpos[self._tip], data.xaxis[:NUM_JOINTS]
         lever = jnp.cross(axis, tip - data.xanchor[:NUM_JOINTS])
@@ -178,7 +178,7 @@ class Place(Env):
 
     @functools.partial(jax.jit, static_argnums=0)
     def model_of(self, task: PlaceTask) -> mjx.Model:
-        """The model with the task's thing and containers: their geoms."""
+        """Sets the geoms of the task's thing and containers in the model."""
         model = self.model
         pos, quat, size = model.geom_pos, model.geom_quat, model.geom_size
         for geoms, (one, unit) in zip(self._geom, self._geoms_of(task), strict=True):
@@ -187,19 +187,19 @@ class Place(Env):
         return model.replace(geom_pos=pos, geom_quat=quat, geom_size=size)
 
     def _geoms_of(self, task: PlaceTask) -> list[tuple[Any, jax.Array]]:
-        """The geoms of the thing, which hangs from the tip, and of the containers, each with its unit of length."""
+        """Returns the geoms of the thing, which hangs from the tip, and of the containers, each with its unit (m)."""
         thing = jax.tree.map(lambda x: x[task.thing], self._things)
         thing = thing._replace(pos=thing.pos.at[:, 2].add(-self._tops[task.thing]))
         picked = [jax.tree.map(lambda x, i=i: x[task.container[i]], self._containers) for i in range(NUM_CONTAINERS)]
         return [(thing, task.thing_size), *zip(picked, task.container_size, strict=True)]
 
     def robot_state(self, state: State) -> jax.Array:
-        """[16] joint angles, tip position, the directions in which the hand points and faces."""
+        """Returns [16] joint angles, tip position, and the directions in which the hand points and faces."""
         tip, axes, _ = self.hand(state.qpos)
         return jnp.concatenate([state.qpos, tip, axes[:, 0], axes[:, 2]])
 
     def colors(self, task: PlaceTask) -> jax.Array:
-        """[G, 4] RGBA of every geom; what a thing or container does not use is transparent."""
+        """Returns [G, 4] RGBA of every geom; what a thing or container does not use is transparent."""
         rgba = self._rgba
         for geoms, color, (one, _) in zip(self._geom, task.color, self._geoms_of(task), strict=True):
             seen = one.seen if isinstance(one, primitives.Geoms) else one.used
@@ -207,31 +207,31 @@ class Place(Env):
         return rgba
 
     def textures(self, task: PlaceTask, data: mjx.Data) -> Textures:
-        """[G] those of the thing and the containers; all else is plain."""
+        """Returns the textures [G] of the thing and the containers; all else is plain."""
         return textures.on_geoms(task.texture, self._body, self.mj_model.geom_bodyid, data.xpos, data.xmat)
 
     def target_kind(self, task: PlaceTask) -> jax.Array:
-        """The target's index into CONTAINERS."""
+        """Returns the target's index into CONTAINERS."""
         return task.container[task.target]
 
     def release_height(self, task: PlaceTask) -> jax.Array:
-        """Height of the tip (m) at which the thing hangs CLEARANCE above the target's rim."""
+        """Returns the height of the tip (m) at which the thing hangs CLEARANCE above the target's rim."""
         rim = task.container_size[task.target] * self._containers.height[task.container[task.target]]
         return rim + task.thing_size * self._tops[task.thing] + CLEARANCE
 
     def running_residual(self, task: PlaceTask, state: State, action: jax.Array, t: jax.Array) -> jax.Array:
-        """[15] tip off its place over the target (m), hand off pointing down and facing forward, action, weighted."""
+        """Returns [15]: the tip's distance from over the target (m), the hand's tilt and turn, and action, weighted."""
         return jnp.concatenate([self.terminal_residual(task, state), self.action_cost * action])
 
     def terminal_residual(self, task: PlaceTask, state: State) -> jax.Array:
-        """[9] the same without the action."""
+        """Returns [9]: the same without the action."""
         tip, axes, _ = self.hand(state.qpos)
         goal = state.mocap_pos[task.target].at[2].set(self.release_height(task))
         upright = jnp.concatenate([axes[:, 0] + jnp.array([0.0, 0.0, 1.0]), axes[:, 2] - jnp.array([1.0, 0.0, 0.0])])
         return jnp.concatenate([OFF_COST * (tip - goal), TURN_COST * upright])
 
     def falls(self, task: PlaceTask, state: State) -> tuple[Fall, Fall]:
-        """The thing when it has fallen, and on its way, from when the hand opens (`milx.envs.place.drop`).
+        """Lets the thing fall when the hand opens: its last state, and those on its way (`milx.envs.place.drop`).
 
         It can hit the container whose middle is closest under the hand, and the table.
         """
@@ -244,7 +244,7 @@ class Place(Env):
         return self._drop.fall(*thing, container, task.container_size[under], state.mocap_pos[under], tip, turn)
 
     def film(self, task: PlaceTask, states: State) -> jax.Array:
-        """Images [T + 1 + FALL_FRAMES, H, W, 3] uint8 of an episode and of the fall that follows it."""
+        """Draws images [T + 1 + FALL_FRAMES, H, W, 3] uint8 of an episode and of the fall that follows it."""
         last, model = jax.tree.map(lambda x: x[-1], states), self.model_of(task)
         thing, *_ = self._geoms_of(task)
         data = mjx.kinematics(model, self.data(last))
@@ -265,7 +265,7 @@ class Place(Env):
         return jnp.concatenate([super().film(task, states), jax.vmap(draw)(shown)])
 
     def success(self, task: PlaceTask, states: State) -> jax.Array:
-        """Whether the thing rests within the target's rim, seen from above."""
+        """Tells whether the thing rests within the target's rim, seen from above."""
         last = jax.tree.map(lambda x: x[-1], states)
         end, _ = self.falls(task, last)
         rim = jax.tree.map(lambda x: x[task.container[task.target]], self._containers)
@@ -274,7 +274,7 @@ class Place(Env):
         return inside & (jnp.linalg.norm(end.qvel[:3]) < drop.STILL)
 
     def task_blind(self, key: jax.Array, task: PlaceTask) -> PlaceTask:
-        """The task with a random container as the target."""
+        """Makes a random container the target."""
         return dataclasses.replace(task, target=jax.random.randint(key, (), 0, NUM_CONTAINERS))
 
 
@@ -283,7 +283,7 @@ def _container_names() -> list[str]:
 
 
 def _top(geoms: primitives.Geoms) -> float:
-    """Height of a shape above the table, in its unit of length."""
+    """Computes the height of a shape above the table, in its unit of length."""
     column = np.repeat(
         [{"capsule": 0, "cylinder": 1}.get(kind, 2) for kind in primitives.SLOTS], [*primitives.SLOTS.values()]
     )
@@ -292,7 +292,7 @@ def _top(geoms: primitives.Geoms) -> float:
 
 
 def _draw_looks(key: jax.Array, split: str) -> dict[str, Any]:
-    """Colours and textures of the thing and of the containers."""
+    """Colors and textures of the thing and of the containers."""
     count = 1 + NUM_CONTAINERS
     color_key, texture_key = jax.random.split(key)
     texture = jax.vmap(functools.partial(textures.draw, split=split))(jax.random.split(texture_key, count))
@@ -300,19 +300,19 @@ def _draw_looks(key: jax.Array, split: str) -> dict[str, Any]:
 
 
 def _draw_places(key: jax.Array) -> jax.Array:
-    """[_CANDIDATES, 3, 2] places on the table (m)."""
+    """Samples [_CANDIDATES, 3, 2] positions on the table (m)."""
     shape = (_CANDIDATES, NUM_CONTAINERS, 2)
     return jax.random.uniform(key, shape, minval=jnp.array(LOW), maxval=jnp.array(HIGH))
 
 
 def _first_spaced(draws: jax.Array) -> jax.Array:
-    """[3, 2] the first of the draws that keeps the distances, or the one that comes closest to keeping them."""
+    """Returns the first of the draws that keeps the distances, or the one that comes closest to it: [3, 2]."""
     gap = jnp.linalg.norm(draws[:, [0, 0, 1]] - draws[:, [1, 2, 2]], axis=-1).min(axis=-1)
     return draws[jnp.argmax(jnp.minimum(gap, SPACING))]
 
 
 def _build() -> mujoco.MjModel:
-    """The arm and the table, with a thing in the hand and containers whose geoms every task sets anew."""
+    """Builds the arm and the table, with a thing in the hand and containers whose geoms every task sets anew."""
     spec = mujoco.MjSpec.from_file(str(ASSETS / "place.xml"))
     tip = spec.site("tip")
     facing = [0.5**0.5, 0.0, -(0.5**0.5), 0.0]  # its x along the hand's z, its z against the hand's x

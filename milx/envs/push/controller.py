@@ -21,14 +21,14 @@ SIDE = 0.035
 NEAR = 0.025
 """The hand comes down when it is closer than this to its place behind the object (m)."""
 ARRIVED, BEYOND = 0.03, 0.03
-"""The hand keeps still once the object is this close to the goal's centre, or this far beyond it, where the hand does
+"""The hand keeps still once the object is this close to the goal's center, or this far beyond it, where the hand does
 not follow (m)."""
 TRAVEL_SPEED, PUSH_SPEED, VERTICAL_SPEED = 0.8, 0.17, 0.6
 """m/s. Objects of little friction glide on: at twice this speed they cross the disc in fewer steps than count, and a
 policy that pushes a little faster than its demonstrations fails."""
 _FEEDBACK = (4.0, 4.0, 2.0, 3.0, 1.0, 1.0, 0.6)  # on the joints' velocities (N m s/rad)
 _WEIGHTS = (1.0, 1.0, 1.0, *(0.03,) * 6)  # of the tip's velocity, and of the two directions'
-_REGULARISATION = 2e-3
+_REGULARIZATION = 2e-3
 
 
 def torque(
@@ -49,11 +49,11 @@ def torque(
         jacobian: [9, 7] of the pose by the joint angles.
         velocity: [7] of the joints (rad/s).
         damping: [7] of the joints (N m s/rad).
-        place: [2] of the object's centre (m); the goal is at 0.
-        ahead: [2] unit vector from the object's centre to the goal.
-        touching: how far behind the object's centre the tip is when it touches the object (m).
-        aside: how far to the left of the object's centre, as the hand sees it, the hand pushes (m): where a long thing
-            turns away from under a hand behind its centre, another place may do.
+        place: [2] of the object's center (m); the goal is at 0.
+        ahead: [2] unit vector from the object's center to the goal.
+        touching: how far behind the object's center the tip is when it touches the object (m).
+        aside: how far to the left of the object's center, as the hand sees it, the hand pushes (m): where a long thing
+            turns away from under a hand behind its center, another place may do.
         friction: of the object against sliding (N s/m).
     """
     tip, away = pose[:3], jnp.linalg.norm(place)
@@ -80,7 +80,7 @@ def torque(
     still = (away < ARRIVED) | (place[0] > BEYOND)
     wanted = jnp.where(still, 0.0, wanted)
     weighted = jnp.array(_WEIGHTS)[:, None] * jacobian
-    normal = jacobian.T @ weighted + _REGULARISATION * jnp.eye(7)
+    normal = jacobian.T @ weighted + _REGULARIZATION * jnp.eye(7)
     joint_velocity = solve_free(normal, weighted.T @ wanted, jnp.ones(7, bool))
     force = jnp.where(pushing & ~still, friction * speed, 0.0) * ahead
     feedback = jnp.array(_FEEDBACK) * (joint_velocity - velocity)
@@ -88,5 +88,5 @@ def torque(
 
 
 def _at_most(velocity: jax.Array, speed: float) -> jax.Array:
-    """The velocity, slowed down to this speed."""
+    """Slows the velocity down to this speed."""
     return velocity * jnp.minimum(1, speed / jnp.maximum(jnp.linalg.norm(velocity), 1e-6))

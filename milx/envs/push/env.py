@@ -18,7 +18,7 @@ from milx.render import textures
 from milx.render.textures import Textures
 
 GOAL_RADIUS = 0.08
-"""The red disc's (m); its centre is at x = y = 0."""
+"""The red disc's (m); its center is at x = y = 0."""
 NEAR_GOAL = 0.13
 """The paper's released code counts steps in which the object is this close to the goal (m)."""
 STEPS_ON_GOAL = 10
@@ -28,7 +28,7 @@ LOW, HIGH = (-0.3, -0.2), (0.0, 0.2)
 FROM_GOAL = 0.17
 """Least distance of an object's start from the goal (m)."""
 SPACING = 0.15
-"""Least distance between the objects' centres at the start (m; paper: 0.1). They lie on opposite sides."""
+"""Least distance between the objects' centers at the start (m; paper: 0.1). They lie on opposite sides."""
 SIZE = (0.038, 0.052)
 """Unit of length of the shapes (m), drawn uniformly."""
 MASS = (0.2, 1.0)
@@ -36,7 +36,7 @@ MASS = (0.2, 1.0)
 DAMPING = (0.2, 5.0)
 """Of an object's sliding (N s/m), drawn uniformly."""
 BEHIND = 1.25
-"""The hand comes down about so many times as far from the goal's centre as the object is."""
+"""The hand comes down about so many times as far from the goal's center as the object is."""
 NUM_JOINTS = 7
 _START = (0.0, -0.895, 0.0, 2.397, 0.0, 0.069, 0.0)
 _OUT_OF_THE_WAY = (0.0, 0.0, -10.0)
@@ -124,11 +124,11 @@ class Push(Env):
         )
 
     def redraw_appearance(self, key: jax.Array, task: PushTask) -> PushTask:
-        """The same objects in other colours and textures."""
+        """Gives the same objects other colors and textures."""
         return dataclasses.replace(task, **_draw_looks(key, "train"))
 
     def redraw_scene(self, key: jax.Array, task: PushTask, states: State) -> State:
-        """The same states: both objects may have been touched."""
+        """Returns the same states: both objects may have been touched."""
         return states
 
     def reset(self, key: jax.Array, task: PushTask) -> State:
@@ -157,7 +157,7 @@ class Push(Env):
 
     @functools.partial(jax.jit, static_argnums=0)
     def model_of(self, task: PushTask) -> mjx.Model:
-        """The model with the task's objects: their geoms, masses, inertias and friction."""
+        """Sets the geoms, masses, inertias and friction of the task's objects in the model."""
         model, unit, shapes = self.model, task.size[:, None, None], self._shapes_of(task)
         objects, geoms, dofs = self._body, self._geom, self._dof
         # A plate on a viscous table: what holds for a point holds for turning, times the mean squared lever.
@@ -179,40 +179,40 @@ class Push(Env):
         )
 
     def _shapes_of(self, task: PushTask) -> Geoms:
-        """The geoms of the task's two objects, with a leading axis of 2."""
+        """Returns the geoms of the task's two objects, with a leading axis of 2."""
         return jax.tree.map(lambda x: x[task.shape], self._shapes)
 
     def target_kind(self, task: PushTask) -> jax.Array:
-        """The target's shape, an index into SHAPES."""
+        """Returns the target's shape, an index into SHAPES."""
         return task.shape[task.target]
 
     def objects(self, state: State) -> jax.Array:
-        """[2, 3] x, y (m) and turn (rad) of both objects."""
+        """Returns [2, 3] x, y (m) and turn (rad) of both objects."""
         return state.qpos[NUM_JOINTS:].reshape(2, 3)
 
     @functools.partial(jax.jit, static_argnums=0)
     def hand(self, qpos: jax.Array) -> jax.Array:
-        """[9] tip position (m), unit vectors of the hand's pushing and of its prongs, for all joint positions [13]."""
+        """Returns [9]: tip position (m) and unit vectors of the hand's pushing and of its prongs, at joints [13]."""
         data = mjx.kinematics(self.model, self._data.replace(qpos=qpos))
         pose = data.xmat[self._hand].reshape(3, 3)
         return jnp.concatenate([data.site_xpos[self._tip], pose[:, 2], pose[:, 0]])
 
     def robot_state(self, state: State) -> jax.Array:
-        """[20] joint angles, joint velocities, tip position, direction of pushing."""
+        """Returns [20] joint angles, joint velocities, tip position, and direction of pushing."""
         return jnp.concatenate([state.qpos[:NUM_JOINTS], state.qvel[:NUM_JOINTS], self.hand(state.qpos)[:6]])
 
     def colors(self, task: PushTask) -> jax.Array:
-        """[G, 4] RGBA of every geom; what a shape does not use is transparent."""
+        """Returns [G, 4] RGBA of every geom; what a shape does not use is transparent."""
         seen = self._shapes_of(task).seen.astype(float)
         color = jnp.broadcast_to(task.color[:, None], (*seen.shape, 3))
         return self._rgba.at[self._geom].set(jnp.concatenate([color, seen[..., None]], axis=-1))
 
     def textures(self, task: PushTask, data: mjx.Data) -> Textures:
-        """[G] the objects' textures; all else is plain."""
+        """Returns the textures [G] of the objects; all else is plain."""
         return textures.on_geoms(task.texture, self._body, self.mj_model.geom_bodyid, data.xpos, data.xmat)
 
     def guess(self, task: PushTask, state: State) -> jax.Array:
-        """[T, 7] what `push_controller` does from here."""
+        """Returns [T, 7], what `push_controller` does from here."""
         tactic = jnp.asarray(self.tactics[0])
 
         def step(state: State, _: None) -> tuple[State, jax.Array]:
@@ -222,7 +222,7 @@ class Push(Env):
         return jax.lax.scan(step, state, length=self.horizon)[1]
 
     def control(self, task: PushTask, state: State, tactic: jax.Array) -> jax.Array:
-        """[7] the action of `push_controller` for one state, pushing so far (m) to the side of the object's centre."""
+        """Returns [7], what `push_controller` does in one state, `tactic` (m) to the side of the object's center."""
         target = task.target
         x, y, turn = self.objects(state)[target]
         pose, jacobian = self.hand(state.qpos), jax.jacfwd(self.hand)(state.qpos)[:, :NUM_JOINTS]
@@ -238,7 +238,7 @@ class Push(Env):
         return jnp.clip(torque / self.mj_model.actuator_gear[:, 0], *self.action_range)
 
     def running_residual(self, task: PushTask, state: State, action: jax.Array, t: jax.Array) -> jax.Array:
-        """[11] object off goal, tip off object (m), and action, weighted.
+        """Returns [11]: the object's distance from the goal, the tip's from the object (m), and the action, weighted.
 
         The terms of the released code's reward, but their squares instead of their norms.
         """
@@ -246,37 +246,37 @@ class Push(Env):
         return jnp.concatenate([OBJECT_COST * place, TIP_COST * (tip - place), self.action_cost * action])
 
     def terminal_residual(self, task: PushTask, state: State) -> jax.Array:
-        """[2] object off goal (m), weighted."""
+        """Returns [2]: the object's distance from the goal (m), weighted."""
         return FINAL_COST * self.objects(state)[task.target, :2]
 
     def steps_near_goal(self, task: PushTask, states: State, radius: float) -> jax.Array:
-        """In how many of the steps the target's centre is closer to the goal's than `radius` (m)."""
+        """Counts the steps in which the target's center is closer to the goal's than `radius` (m)."""
         place = jax.vmap(self.objects)(jax.tree.map(lambda x: x[1:], states))[:, task.target, :2]
         return (jnp.linalg.norm(place, axis=-1) < radius).sum()
 
     def success(self, task: PushTask, states: State) -> jax.Array:
-        """Whether the target's centre was on the disc for at least STEPS_ON_GOAL steps (paper, Section 6.2)."""
+        """Tells whether the target's center was on the disc for at least STEPS_ON_GOAL steps (paper, Section 6.2)."""
         return self.steps_near_goal(task, states, GOAL_RADIUS) >= STEPS_ON_GOAL
 
     def other_criteria(self, task: PushTask, states: State) -> dict[str, jax.Array]:
-        """That of the paper's released code."""
+        """Judges the episode by the criterion of the paper's released code."""
         near = self.steps_near_goal(task, states, NEAR_GOAL)
         return {f"within {NEAR_GOAL} m of the goal for at least {STEPS_ON_GOAL} of 100 steps": near >= STEPS_ON_GOAL}
 
     def task_blind(self, key: jax.Array, task: PushTask) -> PushTask:
-        """The task with a random object as the target."""
+        """Makes a random object the target."""
         return dataclasses.replace(task, target=jax.random.randint(key, (), 0, 2))
 
 
 def _draw_looks(key: jax.Array, split: str) -> dict[str, Any]:
-    """Colours and textures of two objects."""
+    """Colors and textures of two objects."""
     color_key, texture_key = jax.random.split(key)
     texture = jax.vmap(functools.partial(textures.draw, split=split))(jax.random.split(texture_key))
     return {"color": jax.random.uniform(color_key, (2, 3)), "texture": texture}
 
 
 def _build() -> mujoco.MjModel:
-    """The arm and the table, with two objects whose geoms every task sets anew."""
+    """Builds the arm and the table, with two objects whose geoms every task sets anew."""
     spec = mujoco.MjSpec.from_file(str(ASSETS / "push.xml"))
     hinge, slide = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
     for name in _OBJECTS:

@@ -1,4 +1,4 @@
-"""Reach: a planar two-joint arm goes to one of three cubes, known by its colour or its number (paper, Section 6.1)."""
+"""Reach: a planar two-joint arm goes to one of three cubes, known by its color or its number (paper, Section 6.1)."""
 
 import dataclasses
 import functools
@@ -15,12 +15,12 @@ NUM_OBJECTS = 3
 EXTENT = 0.2
 """Cubes stand within +-EXTENT of the arm's base in x and y (m)."""
 SPACING = 0.15
-"""Least distance between two cubes' centres (m)."""
+"""Least distance between two cubes' centers (m)."""
 TOUCH = 0.05
-"""A fingertip closer than this to the target's centre, seen from above, has reached it (m)."""
+"""A fingertip closer than this to the target's center, seen from above, has reached it (m)."""
 LAST_STEPS = 10
 """The target must be touched in one of the last steps of the episode."""
-# Colour grids {offset, offset + 0.1, ...}^3 of the splits: disjoint, so that test and validation colours are held out.
+# Color grids {offset, offset + 0.1, ...}^3 of the splits: disjoint, so that test and validation colors are held out.
 COLOR_OFFSETS = {"train": 0.0, "validation": 0.025, "test": 0.05}
 VELOCITY_COST = 0.02
 _CANDIDATES = 64
@@ -29,7 +29,7 @@ _CANDIDATES = 64
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class ReachTask:
-    """Which colour to go to.
+    """Which color to go to.
 
     Attributes:
         object_color: [3, 3] RGB in [0, 1] of the cubes.
@@ -75,14 +75,14 @@ class Reach(Env):
         return self.image_to_plane((-EXTENT, -EXTENT), (EXTENT, EXTENT), self._height)
 
     def sample_task(self, key: jax.Array, split: str) -> ReachTask:
-        """Draws three different colours from the split's grid, and the target among them."""
+        """Draws three different colors from the split's grid, and the target among them."""
         check_split(split)
         color_key, target_key = jax.random.split(key)
         target = jax.random.randint(target_key, (), 0, NUM_OBJECTS)
         return ReachTask(object_color=_draw_colors(color_key, split), target=target)
 
     def redraw_appearance(self, key: jax.Array, task: ReachTask) -> ReachTask:
-        """The same target among other colours of the training grid."""
+        """Keeps the target among cubes of other colors of the training grid."""
         return dataclasses.replace(task, object_color=_draw_colors(key, "train"))
 
     def reset(self, key: jax.Array, task: ReachTask) -> State:
@@ -92,7 +92,7 @@ class Reach(Env):
         return State(jnp.zeros(2), jnp.zeros(2), jnp.concatenate([position, height], axis=-1))
 
     def redraw_scene(self, key: jax.Array, task: ReachTask, states: State) -> State:
-        """The same motion to the same place, with the two other cubes elsewhere."""
+        """Keeps the motion and the target, and moves the two other cubes elsewhere."""
         target = states.mocap_pos[0, task.target, :2]
         position = _first_spaced(_draw_positions(key).at[:, task.target].set(target))
         return dataclasses.replace(states, mocap_pos=states.mocap_pos.at[..., :2].set(position))
@@ -134,34 +134,34 @@ class Reach(Env):
         return jnp.concatenate([data.qvel, data.qacc])
 
     def robot_state(self, state: State) -> jax.Array:
-        """[8] joint angles, joint velocities, fingertip position, fingertip velocity."""
+        """Returns [8] joint angles, joint velocities, fingertip position, and fingertip velocity."""
         position, velocity = jax.jvp(self.fingertip, (state.qpos,), (state.qvel,))
         return jnp.concatenate([state.qpos, state.qvel, position, velocity])
 
     def colors(self, task: ReachTask) -> jax.Array:
-        """[G, 4] RGBA of every geom."""
+        """Returns [G, 4] RGBA of every geom."""
         return self._rgba.at[self._object_geoms, :3].set(task.object_color)
 
     def off_target(self, task: ReachTask, state: State) -> jax.Array:
-        """[2] from the target to the fingertip in the plane (m)."""
+        """Returns [2], from the target to the fingertip in the plane (m)."""
         return self.fingertip(state.qpos) - state.mocap_pos[task.target, :2]
 
     def running_residual(self, task: ReachTask, state: State, action: jax.Array, t: jax.Array) -> jax.Array:
-        """[6] fingertip off target (m), joint velocities and motor commands, weighted."""
+        """Returns [6]: from the target to the fingertip (m), joint velocities and motor commands, weighted."""
         return jnp.concatenate([self.off_target(task, state), VELOCITY_COST * state.qvel, self.action_cost * action])
 
     def terminal_residual(self, task: ReachTask, state: State) -> jax.Array:
-        """[4] fingertip off target (m) and joint velocities, weighted."""
+        """Returns [4]: from the target to the fingertip (m) and joint velocities, weighted."""
         return jnp.concatenate([5.0 * self.off_target(task, state), VELOCITY_COST * state.qvel])
 
     def success(self, task: ReachTask, states: State) -> jax.Array:
-        """Whether the fingertip touched the target in one of the last LAST_STEPS steps (paper, Appendix A)."""
+        """Tells whether the fingertip touched the target in one of the last LAST_STEPS steps (paper, Appendix A)."""
         last = jax.tree.map(lambda x: x[-LAST_STEPS:], states)
         gap = jax.vmap(self.off_target, in_axes=(None, 0))(task, last)
         return jnp.any(jnp.linalg.norm(gap, axis=-1) < TOUCH)
 
     def task_blind(self, key: jax.Array, task: ReachTask) -> ReachTask:
-        """The task with a random cube as the target."""
+        """Makes a random cube the target."""
         return dataclasses.replace(task, target=jax.random.randint(key, (), 0, NUM_OBJECTS))
 
 
@@ -174,12 +174,12 @@ def _arm() -> mujoco.MjModel:
 
 
 def _draw_positions(key: jax.Array) -> jax.Array:
-    """[_CANDIDATES, 3, 2] positions in the arena (m)."""
+    """Samples [_CANDIDATES, 3, 2] positions in the arena (m)."""
     return jax.random.uniform(key, (_CANDIDATES, NUM_OBJECTS, 2), minval=-EXTENT, maxval=EXTENT)
 
 
 def _first_spaced(draws: jax.Array) -> jax.Array:
-    """[3, 2] the first of the draws that keeps the distances.
+    """Returns the first of the draws that keeps the distances: [3, 2].
 
     Each does with probability 0.31, or 0.23 if one cube must stand in the middle, so one of 64 always does.
     """
@@ -188,7 +188,7 @@ def _first_spaced(draws: jax.Array) -> jax.Array:
 
 
 def _draw_colors(key: jax.Array, split: str) -> jax.Array:
-    """[3, 3] three different colours of the split's grid."""
+    """Samples three different colors of the split's grid: [3, 3]."""
     index = jax.random.choice(key, 1000, (NUM_OBJECTS,), replace=False)
     grid = jnp.stack([index // 100, index // 10 % 10, index % 10], axis=-1).astype(float)
     return grid * 0.1 + COLOR_OFFSETS[split]
@@ -207,5 +207,5 @@ class ReachState(Reach):
     object_indices = ((8, 9), (10, 11), (12, 13))
 
     def robot_state(self, state: State) -> jax.Array:
-        """[14] the robot's 8, then the cubes' x and y."""
+        """Returns [14]: the robot's 8, then the cubes' x and y."""
         return jnp.concatenate([super().robot_state(state), state.mocap_pos[:, :2].ravel()])

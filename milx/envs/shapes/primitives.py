@@ -33,7 +33,7 @@ class Capsule(NamedTuple):
 
 
 class Ellipsoid(NamedTuple):
-    """An ellipsoid: centre and half-axes."""
+    """An ellipsoid: center and half-axes."""
 
     x: float
     y: float
@@ -44,7 +44,7 @@ class Ellipsoid(NamedTuple):
 
 
 class Box(NamedTuple):
-    """A box: centre, half-lengths, and its turn about the vertical (rad)."""
+    """A box: center, half-lengths, and its turn about the vertical (rad)."""
 
     x: float
     y: float
@@ -56,7 +56,7 @@ class Box(NamedTuple):
 
 
 class Cylinder(NamedTuple):
-    """An upright cylinder: centre, radius and half-height."""
+    """An upright cylinder: center, radius and half-height."""
 
     x: float
     y: float
@@ -80,7 +80,7 @@ class Shape:
 
 
 def shape(*primitives: Capsule | Ellipsoid | Box | Cylinder) -> Shape:
-    """A shape of these primitives.
+    """Builds a shape of these primitives.
 
     Raises:
         ValueError: for too many of a kind, or no capsule.
@@ -97,7 +97,7 @@ def shape(*primitives: Capsule | Ellipsoid | Box | Cylinder) -> Shape:
 
 
 def ball(x: float, y: float, radius: float) -> Capsule:
-    """A capsule of no length."""
+    """Makes a capsule of no length."""
     return Capsule(x, y, x, y, radius)
 
 
@@ -111,7 +111,7 @@ def strokes(text: str, radius: float = 0.22) -> Shape:
 
 
 def turned(*profile: tuple[str, float, float]) -> Shape:
-    """A turned piece: ellipsoids and cylinders on each other, (kind, radius, height) each, from the table upwards.
+    """Stacks ellipsoids and cylinders, (kind, radius, height) each, from the table upwards: a turned piece.
 
     All of them are squat, so that they hide little of what stands behind them.
     """
@@ -130,7 +130,7 @@ def turned(*profile: tuple[str, float, float]) -> Shape:
 
 
 class Geoms(NamedTuple):
-    """A shape as geoms of a body whose origin is the centre of the outline's area, on the table.
+    """A shape as geoms of a body whose origin is the center of the outline's area, on the table.
 
     P is the sum of SLOTS. The unit of length is the geometric mean of two radii: that of a disc of the outline's
     area, and the distance of its farthest point from the origin.
@@ -157,22 +157,22 @@ class Geoms(NamedTuple):
 
 
 def to_geoms(shape: Shape) -> Geoms:
-    """The geoms of a shape, centred and scaled."""
-    centre, squared_gyration, unit = _outline(shape.capsules)
+    """Builds the geoms of a shape, centered and scaled."""
+    center, squared_gyration, unit = _outline(shape.capsules)
     kinds: tuple[tuple, ...] = (shape.capsules, shape.ellipsoids, shape.boxes, shape.cylinders)
     rows: list[tuple[list[float], list[float], list[float], bool, bool]] = []
     for limit, primitives in zip(SLOTS.values(), kinds, strict=True):
         rows += [(*_to_geom(p), True, not isinstance(p, Capsule) or p.seen) for p in primitives]
         rows += [([0, 0, 0], [1, 0, 0, 0], [unit] * 3, False, False)] * (limit - len(primitives))
     pos, quat, size, used, seen = (np.array(column) for column in zip(*rows, strict=True))
-    pos[used, :2] -= centre
+    pos[used, :2] -= center
     ends, radius = _ends(shape.capsules + shape.capsules[:1] * (NUM_CAPSULES - len(shape.capsules)))
     squared_gyration /= unit**2
-    return Geoms(pos / unit, quat, size / unit, used, seen, squared_gyration, (ends - centre) / unit, radius / unit)
+    return Geoms(pos / unit, quat, size / unit, used, seen, squared_gyration, (ends - center) / unit, radius / unit)
 
 
 def _to_geom(p: Capsule | Ellipsoid | Box | Cylinder) -> tuple[list[float], list[float], list[float]]:
-    """Position, quaternion and size of a primitive."""
+    """Returns the position, quaternion and size of a primitive."""
     upright = [1.0, 0.0, 0.0, 0.0]
     match p:
         case Capsule():
@@ -195,20 +195,20 @@ def _ends(capsules: tuple[Capsule, ...]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _outline(capsules: tuple[Capsule, ...]) -> tuple[np.ndarray, float, float]:
-    """Centre [2] of the area that the capsules cover, its mean squared distance from there, and the unit of length."""
+    """Returns the center [2] of the area of the capsules, its mean squared distance from there, and the unit."""
     ends, radius = _ends(capsules)
     low, high = (ends.min(axis=(0, 1)) - radius.max(), ends.max(axis=(0, 1)) + radius.max())
     grid = np.stack(np.meshgrid(*(np.arange(a, b, _SPACING) for a, b in zip(low, high, strict=True))), axis=-1)
     covered = grid[(distance_to_outline(grid, ends, radius) <= 0)]
-    centre = covered.mean(axis=0)
-    squared_gyration = float(np.square(covered - centre).sum(axis=-1).mean())
-    reach = (np.linalg.norm(ends - centre, axis=-1).max(axis=-1) + radius).max()
+    center = covered.mean(axis=0)
+    squared_gyration = float(np.square(covered - center).sum(axis=-1).mean())
+    reach = (np.linalg.norm(ends - center, axis=-1).max(axis=-1) + radius).max()
     disc = (len(covered) * _SPACING**2 / np.pi) ** 0.5
-    return centre, squared_gyration, float((reach * disc) ** 0.5)
+    return center, squared_gyration, float((reach * disc) ** 0.5)
 
 
 def distance_to_outline(points: np.ndarray, ends: np.ndarray, radius: np.ndarray) -> np.ndarray:
-    """[...] signed distance of points [..., 2] to the union of capsules with ends [N, 2, 2] and radii [N]."""
+    """Computes [...] signed distances of points [..., 2] to the union of capsules with ends [N, 2, 2] and radii [N]."""
     along = ends[:, 1] - ends[:, 0]
     offset = points[..., None, :] - ends[:, 0]
     t = np.clip((offset * along).sum(axis=-1) / np.maximum(np.square(along).sum(axis=-1), 1e-12), 0, 1)
