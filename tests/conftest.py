@@ -66,7 +66,7 @@ class Scheduling(LoadScopeScheduling):
 
 
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Scheduling:
-    """Called by xdist where there are several processes."""
+    """Schedules the tests where there are several processes; xdist calls it."""
     return Scheduling(config, log)
 
 

@@ -53,7 +53,7 @@ def cases(name):
 
 
 def accepted(function):
-    """What it returns, or None where an error says why not, in the way that all do."""
+    """Returns what the function does, or None where an error says what is wrong in the way that all do."""
     try:
         return function()
     except (ValueError, flags.Error) as error:
@@ -84,7 +84,7 @@ ARRAYS = st.one_of(
 
 @st.composite
 def almost_good_demos(draw):
-    """Fitting arrays, but for one at most."""
+    """Draws fitting arrays, but for one at most."""
     length = draw(st.sampled_from([1, 2, 6, 10**6]))
     fields = {"image": (np.uint8, (4, 5, 3)), "state": (np.float32, (3,)), "action": (np.float64, (2,))}
     arrays = {name: np.broadcast_to(dtype(1), (length, *shape)) for name, (dtype, shape) in fields.items()}
@@ -134,7 +134,7 @@ JSON = st.recursive(
 @cases("configs")
 @given(data=st.data())
 def test_configs(data):
-    """A field of a preset with any value: what is accepted comes back, and is a number where it must be one."""
+    """Sets a field of a preset to any value: what is accepted comes back, and is a number where it must be one."""
     env = data.draw(st.sampled_from(sorted(PRESETS)))
     values = assemble.to_dict(make_config(env, preset="cpu"))
     name = data.draw(st.sampled_from([*assemble.flatten(values), "train", "nope"]))
@@ -259,7 +259,7 @@ CELLS = st.one_of(
 @cases("parquet")
 @given(data=st.data())
 def test_tables_of_lerobot(data, tmp_path_factory):
-    """A column of any type, or without some of its values."""
+    """Gives a column any type, or takes some of its values away."""
     root = pathlib.Path(shutil.copytree(FIXTURES / "lerobot", tmp_path_factory.mktemp("bad") / "set"))
     path = data.draw(st.sampled_from(sorted(path.relative_to(root) for path in root.rglob("*.parquet"))))
     table = pyarrow.parquet.read_table(root / path)

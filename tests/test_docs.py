@@ -20,7 +20,7 @@ def blocks(path, language):
 
 @pytest.fixture
 def registries():
-    """What the how-tos register is gone afterwards."""
+    """Forgets afterwards what the how-tos register."""
     before = [(each, dict(each)) for each in (registry.ENVS, registry.METHODS, registry.PRESETS)]
     yield
     for each, entries in before:

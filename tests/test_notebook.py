@@ -104,7 +104,7 @@ def test_a_task_of_ones_own_is_planned_trained_and_judged(execute):
 
 
 def test_demonstrations_of_ones_own_are_learned_from(execute):
-    """Their answer is known: what is adapted to a demonstration must beat what is adapted to another task's."""
+    """Compares policies adapted to a demonstration with those adapted to another task's."""
     text = printed(execute("bring_your_own_demonstrations", steps=400, tasks=0))
     errors = {name: float(re.search(rf"^{name} +([\d.]+)", text, re.MULTILINE).group(1)) for name in NAMES}
     assert errors["after"] < 0.5 * errors["before"]

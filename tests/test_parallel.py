@@ -33,7 +33,7 @@ def random_demos(env, num_tasks, num_demos):
 
 
 def measure(num_devices, everything):
-    """Losses of 50 meta-updates on the first `num_devices` devices; if asked, also trials and planned actions."""
+    """Returns losses of 50 meta-updates on `num_devices` devices; if asked, also trials and planned actions."""
     import jax
     from jax.sharding import Mesh
     from tiny import tiny_config
@@ -85,7 +85,7 @@ def measure(num_devices, everything):
 
 
 def write_data(folder):
-    """A recorded data set of noise, for a run that needs no planner."""
+    """Writes a recorded data set of noise, for a run that needs no planner."""
     from milx.data.dataset import Writer
     from milx.types import Demo
 
@@ -114,7 +114,7 @@ def run(data, folder):
 
 
 def params_of(folder):
-    """The parameters of a run, as one list of numbers; restored on all devices that there are."""
+    """Restores the parameters of a run on all devices that there are, as one list of numbers."""
     import jax
 
     import milx
@@ -173,7 +173,7 @@ def devices(alone):
 
 @pytest.fixture(scope="module")
 def hosts(data, tmp_path_factory):
-    """Two processes that make one run together."""
+    """Runs two processes that make one run together."""
     folder = tmp_path_factory.mktemp("hosts")
     with socket.socket() as free:
         free.bind(("localhost", 0))

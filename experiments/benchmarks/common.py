@@ -19,7 +19,7 @@ ACCELERATED = jax.default_backend() != "cpu"
 def median_ms(
     function: Callable[..., Any], *args: Any, repeats: int = 20, wait: Callable = jax.block_until_ready
 ) -> float:
-    """Median time of a call in ms, after one call to warm up; `wait` blocks until a result is there."""
+    """Measures the median time of a call in ms, after one call to warm up; `wait` blocks until a result is there."""
     wait(function(*args))
     times = []
     for _ in range(repeats):
@@ -30,7 +30,7 @@ def median_ms(
 
 
 def gib(compiled: jax.stages.Compiled) -> float:
-    """Memory that a compiled program needs beside its arguments and results; PyTorch's figures include those."""
+    """Returns the memory a compiled program needs beside arguments and results; PyTorch's numbers include those."""
     return compiled.memory_analysis().temp_size_in_bytes / 2**30
 
 
@@ -65,7 +65,7 @@ class Report:
         self.add(name, median, unit, memory, note)
 
     def attempt(self, name: str, unit: str, function: Callable[[], tuple[float, float | None]], note: str = "") -> None:
-        """The same for a peer; if it cannot run here, says so instead."""
+        """Measures a peer in the same way; if it cannot run here, says so instead."""
         try:
             self.measure(name, unit, function, note)
         except Exception as error:  # whatever keeps a peer from running is the finding

@@ -62,7 +62,7 @@ CODECS = {"AV1, as LeRobot writes": "libsvtav1", "H.264": "h264"}
 
 
 def write_lerobot(root: pathlib.Path, codec: str) -> None:
-    """A set in LeRobot's layout, version 3: one video, of moving squares on noise, and one table."""
+    """Writes a set in LeRobot's layout, version 3: one video, of moving squares on noise, and one table."""
     rng, count = np.random.default_rng(0), TASKS * EPISODES
     video = root / "videos/observation.images.top/chunk-000/file-000.mp4"
     video.parent.mkdir(parents=True)

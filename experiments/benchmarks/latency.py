@@ -48,7 +48,7 @@ def measure_policy(name: str, config: Config, env: Env, report: common.Report) -
 
 
 def measure_evaluation(config: Config, env: Env, report: common.Report) -> None:
-    """Row of the closed-loop evaluation: adapting included, demonstrations given."""
+    """Adds the row of the closed-loop evaluation: adaptation included, demonstrations given."""
     method = methods.make(config, env.spec)
     params = method.init(jax.random.key(0), workload.unit_whitening(env))
     demos = workload.random_demos(env, _TASKS.value, 1)
@@ -61,7 +61,7 @@ def measure_evaluation(config: Config, env: Env, report: common.Report) -> None:
 
 
 def measure_planning(env: Env, report: common.Report) -> None:
-    """Row of demonstrations planned and performed."""
+    """Adds the row of demonstrations planned and performed."""
     count = _PLANS.value or (50 if not common.ACCELERATED else 4096)
     keys = jax.random.split(jax.random.key(0), count)
     task = jax.vmap(env.sample_task, in_axes=(0, None))(keys, "train")

@@ -40,7 +40,7 @@ _DOMAINS = flags.DEFINE_list("domains", ["reach", "push"], "Which sizes.")
 
 
 def domain(name: str) -> tuple[Config, Env]:
-    """Configuration and environment of the paper's experiment."""
+    """Makes the configuration and the environment of the paper's experiment."""
     if name == "push":
         return push_sized.config(), push_sized.PushSized()
     config = make_config("reach", preset="paper")
@@ -51,7 +51,7 @@ def domain(name: str) -> tuple[Config, Env]:
 def compile_gradient(
     config: Config, env: Env, batch: TaskBatch, gradient: Callable[..., Any] = meta_gradient
 ) -> tuple[jax.stages.Compiled, Any]:
-    """The meta-gradient, compiled, and parameters for it."""
+    """Compiles the meta-gradient, and makes parameters for it."""
     method = methods.make(config, env.spec)
     params = method.init(jax.random.key(0), workload.unit_whitening(env))
     jitted = jax.jit(functools.partial(gradient, method.loss))
@@ -59,18 +59,18 @@ def compile_gradient(
 
 
 def vmapped_gradient(loss: Loss, params: Params, batch: TaskBatch) -> Params:
-    """All tasks at once, on a CPU too."""
+    """Computes the meta-gradient of all tasks at once, on a CPU too."""
     return jax.grad(loss, has_aux=True)(params, batch)[0]
 
 
 def lax_convolution(x: jax.Array, kernel: jax.Array, stride: int) -> jax.Array:
-    """What one writes first."""
+    """Convolves as one would write it first."""
     numbers = ("NHWC", "HWIO", "NHWC")
     return jax.lax.conv_general_dilated(x, kernel, (stride, stride), "SAME", dimension_numbers=numbers)
 
 
 def floor_ms(config: Config, env: Env, tasks: int, frames: int) -> tuple[float, str]:
-    """An estimate of the least time of a meta-gradient: operations and bytes over ceilings that are measured here.
+    """Estimates the least time of a meta-gradient: operations and bytes over ceilings that are measured here.
 
     Convolutions in bfloat16, fully connected layers left out. A forward pass counts 1, a backward pass 2 (1 for the
     first layer, which needs no gradient of the image); the support demonstration takes one of each, and twice that
@@ -104,7 +104,7 @@ def floor_ms(config: Config, env: Env, tasks: int, frames: int) -> tuple[float, 
 
 
 def measure_torch(config: Config, env: Env, batch: TaskBatch, mode: str, bf16: bool) -> tuple[float, float]:
-    """Median ms and peak GiB of the PyTorch peer."""
+    """Measures the median ms and the peak GiB of the PyTorch peer."""
     import torch
     import torch_peer
 

@@ -28,7 +28,7 @@ _POINTS = flags.DEFINE_integer("points", None, "Jacobians at once; 2,048 on an a
 
 
 def measure_milx(env: push_sized.PushSized, worlds: int) -> tuple[float, None]:
-    """Substeps/s of `Env.step`."""
+    """Measures substeps/s of `Env.step`."""
     task = env.sample_task(jax.random.key(0), "train")
     state = jax.vmap(env.reset, in_axes=(0, None))(jax.random.split(jax.random.key(1), worlds), task)
     action = jax.random.uniform(jax.random.key(2), (worlds, env.action_size), minval=-1)
@@ -37,7 +37,7 @@ def measure_milx(env: push_sized.PushSized, worlds: int) -> tuple[float, None]:
 
 
 def measure_mjx(env: push_sized.PushSized, worlds: int, impl: str) -> tuple[float, None]:
-    """Substeps/s of `mjx.step`, all of its data carried from step to step."""
+    """Measures substeps/s of `mjx.step`, all of its data carried from step to step."""
     if impl == "warp":
         import warp  # noqa: F401  without it MJX fails later and says less
     model = mjx.put_model(env.mj_model, impl=impl)
@@ -59,7 +59,7 @@ def measure_mjx(env: push_sized.PushSized, worlds: int, impl: str) -> tuple[floa
 
 
 def measure_rollout(env: push_sized.PushSized, worlds: int, threads: int) -> tuple[float, None]:
-    """Substeps/s of C MuJoCo on so many threads."""
+    """Measures substeps/s of C MuJoCo on so many threads."""
     model, steps = env.mj_model, env.substeps
     datas = [mujoco.MjData(model) for _ in range(threads)]
     state = np.zeros((worlds, mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)))
@@ -73,7 +73,7 @@ def measure_rollout(env: push_sized.PushSized, worlds: int, threads: int) -> tup
 
 
 def measure_jacobians(env: push_sized.PushSized, points: int, how: str) -> tuple[float, float]:
-    """Jacobians/s of an action's five substeps, by state and action."""
+    """Measures Jacobians/s of an action's five substeps, by state and action."""
     task = env.sample_task(jax.random.key(0), "train")
     start = env.reset(jax.random.key(1), task)
 

@@ -32,7 +32,7 @@ _THING = """
 
 
 def _arm() -> str:
-    """Seven links inside each other, with a fork of three capsules at the end."""
+    """Writes seven links inside each other, with a fork of three capsules at the end."""
     inner = (
         '<geom name="palm" class="link" fromto="0 -0.04 0.1 0 0.04 0.1" size="0.015"/>'
         '<geom name="left" class="link" fromto="0 0.04 0.1 0 0.04 0.15" size="0.012"/>'
@@ -104,39 +104,39 @@ class PushSized(Env):
         self._effector = self.mj_model.site("effector").id
 
     def sample_task(self, key: jax.Array, split: str) -> Looks:
-        """Random colors."""
+        """Samples colors."""
         return Looks(jax.random.uniform(key, (self.mj_model.ngeom, 3)))
 
     def redraw_appearance(self, key: jax.Array, task: Looks) -> Looks:
-        """Other colors."""
+        """Samples other colors."""
         return self.sample_task(key, "train")
 
     def redraw_scene(self, key: jax.Array, task: Looks, states: State) -> State:
-        """Nothing else to place."""
+        """Returns the same states: there is nothing else to place."""
         return states
 
     def reset(self, key: jax.Array, task: Looks) -> State:
-        """A bent arm, moved at random; the things where they are put."""
+        """Bends the arm and moves it at random; puts the objects where they belong."""
         bent = jnp.array([0.0, 0.6, 0.0, 1.0, 0.0, 0.9, 0.0, *jnp.zeros(6)])
         qpos = bent + jax.random.uniform(key, bent.shape, minval=-0.1, maxval=0.1)
         return State(qpos, jnp.zeros(self.mj_model.nv), jnp.zeros((0, 3)))
 
     def robot_state(self, state: State) -> jax.Array:
-        """[20] joint angles and velocities, position of the effector and two axes' first columns."""
+        """Returns [20] joint angles and velocities, position of the effector, and two axes' first columns."""
         data = mjx.kinematics(self.model, self.data(state))
         pose = [data.site_xpos[self._effector], data.site_xmat[self._effector].reshape(-1)[:3]]
         return jnp.concatenate([state.qpos[:7], state.qvel[:7], *pose])
 
     def colors(self, task: Looks) -> jax.Array:
-        """[G, 4] RGBA."""
+        """Returns [G, 4] RGBA of every geom."""
         return jnp.concatenate([task.color, jnp.ones((len(task.color), 1))], axis=1)
 
     def running_residual(self, task: Looks, state: State, action: jax.Array, t: jax.Array) -> jax.Array:
-        """[7] the action."""
+        """Returns [7], the action."""
         return action
 
     def terminal_residual(self, task: Looks, state: State) -> jax.Array:
-        """[2] the object's displacement."""
+        """Returns [2], the object's displacement."""
         return state.qpos[7:9]
 
     def success(self, task: Looks, states: State) -> jax.Array:
@@ -144,12 +144,12 @@ class PushSized(Env):
         return jnp.bool_(True)
 
     def task_blind(self, key: jax.Array, task: Looks) -> Looks:
-        """The same."""
+        """Returns the same task."""
         return task
 
 
 def config(**train: Any) -> Config:
-    """The paper's network and hyperparameters for push: four 5x5 convolutions of 16 filters, 15 tasks, two heads."""
+    """Returns the paper's hyperparameters for push: four 5x5 convolutions of 16 filters, 15 tasks, two heads."""
     return Config(
         env_name="push_sized",
         method_name="mil",

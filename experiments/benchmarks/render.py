@@ -44,7 +44,7 @@ def random_scenes(env: Env, count: int) -> Scene:
 
 
 def measure_warp(env: Env, count: int) -> tuple[float, None]:
-    """Frames/s of MJX-Warp's batch renderer, which builds its bounding volumes anew for new poses."""
+    """Measures frames/s of MJX-Warp's batch renderer, which builds its bounding volumes anew for new poses."""
     import warp  # noqa: F401  without it MJX fails later and says less
 
     model = env.mj_model
@@ -82,7 +82,7 @@ def measure_warp(env: Env, count: int) -> tuple[float, None]:
 
 
 def measure_opengl(model: mujoco.MjModel, camera: str, image_shape: tuple[int, int]) -> float:
-    """Frames/s of `mujoco.Renderer`."""
+    """Measures frames/s of `mujoco.Renderer`."""
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     model.vis.quality.offsamples = 0  # one sample in a pixel, as milx
@@ -97,14 +97,14 @@ def measure_opengl(model: mujoco.MjModel, camera: str, image_shape: tuple[int, i
 
 
 def measure_opengl_elsewhere(env: Env) -> tuple[float, None]:
-    """The same in another process: without a display, OpenGL may abort."""
+    """Measures the same in another process: without a display, OpenGL may abort."""
     os.environ.setdefault("MUJOCO_GL", "egl")  # for the other process only: where EGL is missing, MuJoCo does not load
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
         return pool.submit(measure_opengl, env.mj_model, env.camera, env.image_shape).result(), None
 
 
 def measure_milx(env: Env, count: int, draw: Callable[[Scene], jax.Array]) -> tuple[float, float]:
-    """Frames/s and GiB of a function from a scene to pixels."""
+    """Measures frames/s and GiB of a function from a scene to pixels."""
     scenes = random_scenes(env, count)
     compiled = jax.jit(jax.vmap(draw)).lower(scenes).compile(platform.pixel_options())
     return 1e3 * count / common.median_ms(compiled, scenes), common.gib(compiled)

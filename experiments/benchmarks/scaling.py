@@ -23,7 +23,7 @@ _FRAMES = flags.DEFINE_integer("frames", None, "Time steps of a demonstration; a
 
 
 def measure(devices: int) -> tuple[float, float]:
-    """Median ms of a step in a scan on so many devices, and GiB on each."""
+    """Measures the median ms of a step in a scan on so many devices, and GiB on each."""
     mesh = Mesh(jax.devices()[:devices], (parallel.AXIS,))
     parallel.mesh = lambda: mesh  # type: ignore[assignment]
     frames = _FRAMES.value

@@ -15,12 +15,12 @@ FOLDER = pathlib.Path(__file__).parents[1] / "results" / "benchmarks"
 
 
 def number(row: dict) -> str:
-    """The median of a row, or that there is none."""
+    """Prints the median of a row, or that there is none."""
     return f"not run ({row['note']})" if row["median"] is None else f"{row['median']:,.4g} {row['unit']}".strip()
 
 
 def table(results: list[dict]) -> str:
-    """All rows of all files."""
+    """Prints all rows of all files."""
     lines = ["| benchmark | what | median | memory | on | commit |", "|---|---|---|---|---|---|"]
     for result in results:
         for row in result["rows"]:
@@ -31,7 +31,7 @@ def table(results: list[dict]) -> str:
 
 
 def draw(results: list[dict], path: pathlib.Path) -> None:
-    """One panel of bars for every file, what was not run left out; peers are gray."""
+    """Draws one panel of bars for every file, without what was not run; peers are gray."""
     figure, axes = plt.subplots(len(results), 1, figsize=(9, 2.2 * len(results)), squeeze=False, layout="constrained")
     for axis, result in zip(axes[:, 0], results, strict=True):
         rows = [row for row in result["rows"] if row["median"] is not None]

@@ -12,7 +12,7 @@ from milx.config.schema import Config
 
 
 def same(x: torch.Tensor, kernel: int, stride: int) -> torch.Tensor:
-    """TensorFlow's SAME padding of [B, C, H, W]."""
+    """Pads [B, C, H, W] as TensorFlow's SAME does."""
     pads = []
     for size in (x.shape[3], x.shape[2]):
         total = max((-(-size // stride) - 1) * stride + kernel - size, 0)
@@ -21,14 +21,14 @@ def same(x: torch.Tensor, kernel: int, stride: int) -> torch.Tensor:
 
 
 def norm(x: torch.Tensor) -> torch.Tensor:
-    """Layer norm over all axes but the first; written out, for the sake of its second derivative."""
+    """Normalizes over all axes but the first; written out, for the sake of its second derivative."""
     axes = tuple(range(1, x.ndim))
     centered = x - x.mean(axes, keepdim=True)
     return centered * torch.rsqrt(centered.square().mean(axes, keepdim=True) + 1e-6)
 
 
 def make_params(config: Config, image: tuple[int, int], state: int, action: int) -> dict[str, torch.Tensor]:
-    """Random parameters."""
+    """Samples parameters."""
     net, params, channels, (height, width) = config.network, {}, 3, image
     for i, (filters, stride) in enumerate(zip(net.filters, net.strides, strict=True)):
         fan_in = channels * net.kernel**2
@@ -44,7 +44,7 @@ def make_params(config: Config, image: tuple[int, int], state: int, action: int)
 
 
 def make_step(config: Config, mode: str, bf16: bool) -> Callable[..., dict[str, torch.Tensor]]:
-    """The meta-gradient as a function of (params, images [N, 2, T, H, W, 3] uint8, states, actions).
+    """Makes a function of (params, images [N, 2, T, H, W, 3] uint8, states, actions) that computes the meta-gradient.
 
     Args:
         config: network and inner step.

@@ -18,7 +18,7 @@ from milx.types import Demo, TaskBatch
 
 
 def random_batch(env: Env, tasks: int, frames: int) -> TaskBatch:
-    """Images, states, actions and goals without meaning."""
+    """Samples images, states, actions and goals without meaning."""
 
     def demo(key: jax.Array) -> Demo:
         keys = jax.random.split(key, 3)
@@ -31,7 +31,7 @@ def random_batch(env: Env, tasks: int, frames: int) -> TaskBatch:
 
 
 def unit_whitening(env: Env) -> Whitening:
-    """Whitening that changes nothing."""
+    """Makes whitening that changes nothing."""
     return Whitening(*(fill(n) for n in (env.state_size, env.action_size) for fill in (jnp.zeros, jnp.ones)))
 
 
@@ -49,7 +49,7 @@ def random_demos(env: Env, num_tasks: int, num_demos: int) -> DemoSet:
 
 
 def measure_step(config: Config, env: Env) -> tuple[float, float]:
-    """Median ms of a training step, rendering included, in a scan on the devices of the mesh; and GiB on each."""
+    """Measures the median ms of a training step with rendering, in a scan on the mesh's devices, and GiB on each."""
     trainer = Trainer(
         sampler(env, config.train),
         methods.make(config, env.spec),

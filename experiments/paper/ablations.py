@@ -33,7 +33,7 @@ _CHANGED = flags.DEFINE_multi_enum("changed", list(ABLATIONS), list(ABLATIONS), 
 
 
 def configure(changes: dict[str, Any], seed: int) -> Config:
-    """A cell of figure 3 with some fields, by dotted name, changed."""
+    """Configures a cell of figure 3 with some fields, by dotted name, changed."""
     config = cells.configure("reach", "mil", options.PRESET.value, seed, options.STEPS.value)
     for name, value in changes.items():
         assemble.assign(config, name, value)
@@ -52,7 +52,7 @@ def main(_: list[str]) -> None:
 
 
 def markdown(results: dict[str, dict[str, Any]], changed: list[str], seeds: int) -> str:
-    """A table of what there is: success on test tasks of every seed, and how long the first one's training took."""
+    """Writes a table of what there is: test success of every seed, and how long the first one's training took."""
     lines = ["| changed | " + " | ".join(f"seed {seed}" for seed in range(seeds)) + " | training |"]
     lines.append("|---|" + "---|" * (seeds + 1))
     for name in changed:

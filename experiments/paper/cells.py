@@ -55,7 +55,7 @@ LEARNING_RATES = {
 
 
 def methods_of(env: str, chosen: list[str] | None) -> list[str]:
-    """The methods of an environment, or those of them that were chosen.
+    """Selects the methods of an environment, or those of them that were chosen.
 
     Raises:
         ValueError: for a method that no environment compares; the message lists those that are.
@@ -67,7 +67,7 @@ def methods_of(env: str, chosen: list[str] | None) -> list[str]:
 
 
 def configure(env: str, method: str, preset: str, seed: int, steps: int | None) -> Config:
-    """A preset as methods are compared: at their own rates, in `steps` meta-updates or STEPS, without redrawn scenes.
+    """Configures a preset as methods are compared: own rates, `steps` or STEPS meta-updates, no redrawn scenes.
 
     A small set of demonstrations is to be small in colors and places, too. On vision reach eight time steps of the
     query and three layers learn faster than the three and two of `fast`, which end a little higher.
@@ -119,7 +119,7 @@ class Cells:
         self._unneeded: list[pathlib.Path] = []
 
     def is_done(self, name: str, config: Config) -> bool:
-        """Whether the cell has its file.
+        """Tells whether the cell has its file.
 
         Raises:
             ValueError: if the file is another configuration's; the message shows the difference.
@@ -206,7 +206,7 @@ class Cells:
         return trained
 
     def _unfinished(self, config: Config, dataset_hash: str) -> pathlib.Path:
-        """Where a cell's checkpoints are until it has its file: a folder for all on which they depend."""
+        """Names the folder of a cell's checkpoints until it has its file: one for all on which they depend."""
         contents = json.dumps([_contents(config), dataset_hash, provenance.origin()])
         return self.folder / "unfinished" / hashlib.sha256(contents.encode()).hexdigest()[:16]
 
@@ -264,7 +264,7 @@ class Cells:
         return self._once(("env", *world), lambda: envs.make(*world))
 
     def _programs(self, config: Config) -> str:
-        """All on which the compiled programs of training depend."""
+        """Describes all on which the compiled programs of training depend."""
         values = assemble.to_dict(config)
         del values["seed"], values["evaluation"], values["data"]["tasks"]
         return json.dumps(values)
@@ -273,7 +273,7 @@ class Cells:
         return jax.tree.map(lambda x: x[: config.data.tasks], self._demos(config, "train"))
 
     def _demos(self, config: Config, split: str) -> DemoSet:
-        """Validation or test tasks, or the training tasks of the largest cell with the same seed."""
+        """Returns validation or test tasks, or the training tasks of the largest cell with the same seed."""
         whole = dataclasses.replace(config, data=dataclasses.replace(config.data, tasks=self.capacity))
         env = self._env(config)
         which = config.seed if split == "train" else config.evaluation.shots
@@ -286,12 +286,12 @@ class Cells:
 
 
 def _contents(config: Config) -> dict[str, Any]:
-    """What makes a cell: how much runs at once does not."""
+    """Selects what makes a cell: how much runs at once does not."""
     values = assemble.to_dict(config)
     del values["evaluation"]["batch"], values["data"]["plan_batch"]
     return values
 
 
 def read(folder: pathlib.Path) -> dict[str, dict[str, Any]]:
-    """All results of a folder, by the names of their cells."""
+    """Reads all results of a folder, by the names of their cells."""
     return {path.stem: json.loads(path.read_text()) for path in sorted(folder.glob("*.json"))}

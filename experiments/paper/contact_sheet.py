@@ -39,7 +39,7 @@ _XML = """
 
 
 def stage(slots: dict[str, int]) -> tuple[Renderer, Scene]:
-    """A renderer for things with these geoms, and a scene without any."""
+    """Makes a renderer for things with these geoms, and a scene without any."""
     geoms = "".join(f'<geom type="{kind}" size="0.1 0.1 0.1"/>' * count for kind, count in slots.items())
     model = mujoco.MjModel.from_xml_string(_XML.format(geoms=geoms))
     data = mujoco.MjData(model)
@@ -49,7 +49,7 @@ def stage(slots: dict[str, int]) -> tuple[Renderer, Scene]:
 
 
 def put(empty: Scene, geoms: primitives.Geoms | containers.Geoms, color: Sequence[float]) -> Scene:
-    """A thing on the plane, with its unit as the unit of length."""
+    """Puts a thing on the plane, with its unit as the unit of length."""
     matrix = np.zeros((len(geoms.quat), 9))
     for row, quat in zip(matrix, geoms.quat, strict=True):
         mujoco.mju_quat2Mat(row, quat)
@@ -61,7 +61,7 @@ def put(empty: Scene, geoms: primitives.Geoms | containers.Geoms, color: Sequenc
 
 
 def wear(scene: Scene, family: str, key: jax.Array) -> Scene:
-    """The scene, its thing in a texture of this family: as `textures.draw` draws it but for the family."""
+    """Dresses the scene's thing in a texture of this family, drawn as `textures.draw` draws it but for the family."""
     drawn = textures.draw(key, "train")
     drawn = drawn._replace(
         family=jnp.asarray(list(textures.FAMILIES).index(family)), frame=drawn.frame.at[:, :3].multiply(SIZE)
@@ -72,7 +72,7 @@ def wear(scene: Scene, family: str, key: jax.Array) -> Scene:
 
 
 def draw(renderer: Renderer, scenes: list[Scene], titles: list[str], path: pathlib.Path) -> None:
-    """One picture of all scenes."""
+    """Draws all scenes into one picture."""
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *scenes)
     images = jax.lax.map(lambda scene: to_uint8(renderer.render(scene).color), stacked)
     rows = -(-len(scenes) // COLUMNS)

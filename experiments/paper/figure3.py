@@ -62,7 +62,7 @@ class Point(NamedTuple):
 
 
 def points(results: list[dict[str, Any]]) -> dict[tuple[str, str], dict[int, Point]]:
-    """The curve of every environment and method: points by the number of demonstrations, in order."""
+    """Collects the curve of every environment and method: points by the number of demonstrations, in order."""
     groups = collections.defaultdict(list)
     for result in results:
         groups[result["env"], result["method"], result["num_demos_train"]].append(result)
@@ -76,12 +76,12 @@ def points(results: list[dict[str, Any]]) -> dict[tuple[str, str], dict[int, Poi
 
 
 def _labels(results: list[dict[str, Any]]) -> dict[tuple[str, str], str]:
-    """What every method is called in every environment."""
+    """Names every method in every environment."""
     return {(result["env"], result["method"]): table.method(result) for result in results}
 
 
 def markdown(results: list[dict[str, Any]]) -> str:
-    """The figure as a table."""
+    """Writes the figure as a table."""
     curves, labels = points(results), _labels(results)
     sizes = sorted({size for curve in curves.values() for size in curve})
     lines = ["| | " + " | ".join(f"{size:,}" for size in sizes) + " |", "|---|" + "---|" * len(sizes)]
@@ -100,7 +100,7 @@ def markdown(results: list[dict[str, Any]]) -> str:
 
 
 def draw(results: list[dict[str, Any]], path: pathlib.Path) -> None:
-    """One panel for each environment: mean of the seeds, a band from the lowest to the highest interval's end."""
+    """Draws one panel for each environment: mean of the seeds, a band from the lowest to the highest interval's end."""
     curves, labels = points(results), _labels(results)
     names = [env for env in cells.METHODS if any(env == key[0] for key in curves)]
     figure, axes = plt.subplots(1, len(names), figsize=(4.5 * len(names), 3.6), squeeze=False, layout="constrained")

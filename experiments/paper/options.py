@@ -12,5 +12,5 @@ _OUT = flags.DEFINE_string("out", None, "Folder of the JSON files; default resul
 
 
 def folder(script: str) -> pathlib.Path:
-    """Where the JSON files are."""
+    """Returns the folder of the JSON files."""
     return pathlib.Path(_OUT.value or pathlib.Path(__file__).parents[1] / "results" / script)

@@ -29,7 +29,7 @@ import summary  # noqa: E402
 
 
 def headline() -> str:
-    """One row for each environment and method, of all seeds."""
+    """Writes one row for each environment and method, of all seeds."""
     fast, of_push, of_place = (cells.read(RESULTS / name) for name in ("reach", "table1", "table3"))
     rows = {
         "reach, MIL": (_named(cells.read(RESULTS / "paper_results"), "reach-1"), "a curve"),
@@ -52,12 +52,12 @@ def _named(found: dict[str, dict[str, Any]], name: str) -> list[dict[str, Any]]:
 
 
 def _paper_table(which: tables.Table) -> str:
-    """By the first of its criteria."""
+    """Writes a table by the first of its criteria."""
     return tables.markdown(which, list(which.rows), cells.read(RESULTS / which.folder)).split("\n\n")[0]
 
 
 def _published(beginning: str) -> str:
-    """The rows of the method as published whose names begin so."""
+    """Writes the rows of the method as published whose names begin so."""
     rows = {name: row for name, row in published.TABLES["results"].items() if name.startswith(beginning)}
     return published.markdown(rows, cells.read(RESULTS / "paper_results"))
 
@@ -80,7 +80,7 @@ TABLES: dict[str, Callable[[], str]] = {
 
 
 def filled(text: str) -> str:
-    """A page with its tables as the result files have them now."""
+    """Fills a page's tables from the result files."""
     return re.sub(r"<!-- ([\w-]+) -->\n.*?<!-- end -->", lambda found: f"{_marked(found[1])}", text, flags=re.DOTALL)
 
 

@@ -44,12 +44,12 @@ def main(_: list[str]) -> None:
 
 
 def _runs(name: str, shots: int, found: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:
-    """The result files of a row's seeds."""
+    """Selects the result files of a row's seeds."""
     return [run for cell, run in found.items() if cell.rpartition("-")[0] == f"{name}-{shots}"]
 
 
 def markdown(rows: dict[str, Row], found: dict[str, dict[str, Any]]) -> str:
-    """A table of what there is: the mean of the seeds, their intervals, the paper's number and the floors."""
+    """Writes a table of what there is: the mean of the seeds, their intervals, the paper's number and the baselines."""
     lines = ["| | success | with another task's | random | task-blind | expert | training | paper |"]
     lines.append("|---|---|---|---|---|---|---|---|")
     for name, row in rows.items():

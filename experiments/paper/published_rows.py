@@ -28,7 +28,7 @@ class Row(NamedTuple):
 
 
 def configure(row: Row, shots: int, seed: int) -> Config:
-    """A cell of a table."""
+    """Configures a cell of a table."""
     config = make_config(row.env, row.method, "paper", seed)
     config.evaluation.shots = shots
     for name, value in row.changes.items():
@@ -37,7 +37,7 @@ def configure(row: Row, shots: int, seed: int) -> Config:
 
 
 def _without(changes: dict[str, Any], *groups: str) -> dict[str, Any]:
-    """The changes but for the fields whose names begin so."""
+    """Removes from the changes the fields whose names begin so."""
     return {name: value for name, value in changes.items() if not name.startswith(groups)}
 
 
@@ -162,7 +162,7 @@ _STEPS = {
 
 
 def _ladder() -> dict[str, Row]:
-    """From `paper` to `fast`, one of milx's changes at a time on top of those before it."""
+    """Builds the rows from `paper` to `fast`: one of milx's changes at a time on top of those before it."""
     rows = {}
     for env, steps in _STEPS.items():
         changes: dict[str, Any] = {}

@@ -13,19 +13,19 @@ LABELS = {"mil": "MIL", "lstm": "LSTM", "lstm_attention": "LSTM with attention"}
 
 
 def method(result: dict) -> str:
-    """What was trained, and whether with milx's goal head, which attention has no use for."""
+    """Names what was trained, and whether with milx's goal head, which attention has no use for."""
     name = result["method"]
     has_goal_head = result["config"]["network"]["goal_head"] and name != "lstm_attention"
     return LABELS.get(name, name) + (" + goal head" if has_goal_head else "")
 
 
 def setting(result: dict) -> str:
-    """The preset, and what was changed in it."""
+    """Names the preset, and what was changed in it."""
     return f"{result['preset']} {result['variant']}".strip()
 
 
 def row(result: dict) -> str:
-    """One result file as a line of the table."""
+    """Writes one result file as a line of the table."""
     low, high = result["wilson95"]
     floors = result["baselines"]
     cells = [
@@ -42,7 +42,7 @@ def row(result: dict) -> str:
 
 
 def mean(group: list[dict]) -> str:
-    """The mean over the runs of one setting as a line of the table."""
+    """Writes the mean over the runs of one setting as a line of the table."""
     successes = [result["success"] for result in group]
     floors = [statistics.mean(r["baselines"][name] for r in group) for name in ("random", "task_blind", "expert")]
     cells = [
@@ -59,7 +59,7 @@ def mean(group: list[dict]) -> str:
 
 
 def markdown(folder: pathlib.Path) -> str:
-    """All results of a folder, and the mean of each setting's seeds."""
+    """Writes all results of a folder, and the mean of each setting's seeds."""
     groups = collections.defaultdict(list)
     for path in sorted(folder.glob("*.json")):
         result = json.loads(path.read_text())

@@ -49,7 +49,7 @@ class Table(NamedTuple):
 
 
 def configure(env: str, row: Row, shots: int, seed: int) -> Config:
-    """A cell: trained on single demonstrations, in new looks whenever they are drawn."""
+    """Configures a cell: trained on single demonstrations, with another appearance whenever they are drawn."""
     config = cells.configure(env, row.method, options.PRESET.value, seed, options.STEPS.value)
     config.train.redraw = True
     config.evaluation.shots = shots
@@ -59,7 +59,7 @@ def configure(env: str, row: Row, shots: int, seed: int) -> Config:
 
 
 def chosen(table: dict[str, Any]) -> dict[str, Any]:
-    """Those of a table's rows that were chosen, by name.
+    """Selects those of a table's rows that were chosen, by name.
 
     Raises:
         ValueError: for a row that the table does not have; the message lists those that it has.
@@ -88,7 +88,7 @@ def make(table: Table) -> None:
 
 
 def markdown(table: Table, rows: list[str], found: dict[str, dict[str, Any]]) -> str:
-    """A table for every criterion: means of the seeds, their intervals, and what floors and expert reach beside them.
+    """Writes a table for every criterion: means of the seeds, their intervals, baselines and upper bound.
 
     Args:
         table: the table.
@@ -125,7 +125,7 @@ def judged(run: dict[str, Any], criterion: str) -> dict[str, Any]:
 
 
 def interval(runs: list[dict[str, Any]]) -> str:
-    """The mean over runs, from where to where their 95% intervals reach, and how many there are."""
+    """Writes the mean over runs, from where to where their 95% intervals reach, and how many there are."""
     ends = intervals(runs)
     low, high = min(end[0] for end in ends), max(end[1] for end in ends)
     return f"{statistics.mean(run['success'] for run in runs):.1%} ({low:.1%} to {high:.1%}; {len(runs)})"

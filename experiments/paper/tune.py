@@ -35,7 +35,7 @@ _METHODS = flags.DEFINE_list("methods", None, "Methods; default all.")
 
 
 def configure(env: str, method: str, candidate: str) -> Config:
-    """A short run, validated at its end only; the schedule ends with it."""
+    """Configures a short run, validated at its end only; the schedule ends with it."""
     config = cells.configure(env, method, options.PRESET.value, seed=0, steps=options.STEPS.value or STEPS[env])
     config.optimizer.learning_rate, config.optimizer.cosine = CANDIDATES[candidate]
     config.train.eval_every = config.train.steps

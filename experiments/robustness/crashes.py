@@ -42,7 +42,7 @@ FLAGS = (
 
 
 def write_data(folder: pathlib.Path) -> None:
-    """A data set of noise: what is learned does not matter."""
+    """Writes a data set of noise: what is learned does not matter."""
     rng = np.random.default_rng(0)
     with Writer(folder, (12, 16), 3, 2, "crashes.py") as writer:
         for task in range(12):
@@ -54,7 +54,7 @@ def write_data(folder: pathlib.Path) -> None:
 
 
 def start(data: pathlib.Path, workdir: pathlib.Path) -> subprocess.Popen:
-    """The launcher, as a user starts it."""
+    """Starts the launcher as a user does."""
     command = [sys.executable, "-m", "milx.train", f"--data={data}", f"--workdir={workdir}", *FLAGS]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
@@ -74,7 +74,7 @@ def finish(data: pathlib.Path, workdir: pathlib.Path) -> str:
 
 
 def writing(workdir: pathlib.Path, before: set[str]) -> bool:
-    """Whether a checkpoint is being written; `before` is what earlier kills left of theirs."""
+    """Tells whether a checkpoint is being written; `before` is what earlier kills left of theirs."""
     return bool(unfinished(workdir) - before)
 
 
@@ -85,7 +85,7 @@ def unfinished(workdir: pathlib.Path) -> set[str]:
 
 
 def last_step(workdir: pathlib.Path) -> int:
-    """Of the newest checkpoint."""
+    """Reads the step of the newest checkpoint."""
     steps = [int(path.name) for path in (workdir / "checkpoints").glob("*") if path.name.isdigit()]
     return max(steps, default=0)
 

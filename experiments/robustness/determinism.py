@@ -45,7 +45,7 @@ class Outcome(NamedTuple):
 
 
 def train(command: list[str], workdir: pathlib.Path, environment: dict[str, str], kill_at: int | None) -> Outcome:
-    """Trains; killed when so many updates are written down, and started again."""
+    """Trains; is killed when so many updates are written down, and started again."""
     environment = {**os.environ, **environment}
     script = "from milx import launch, runs\nlaunch.define_flags()\n"
     script += "launch.run(lambda config, folder: runs.make(config, folder).train())"
@@ -64,13 +64,13 @@ def train(command: list[str], workdir: pathlib.Path, environment: dict[str, str]
 
 
 def metrics(workdir: pathlib.Path) -> list[dict[str, float]]:
-    """What the run has written down so far."""
+    """Reads what the run has written down so far."""
     path = workdir / "metrics.jsonl"
     return read_metrics(path) if path.is_file() else []
 
 
 def others() -> dict[str, tuple[dict[str, str], int | None]]:
-    """What is compared with the first run: environment variables, and when the run is killed."""
+    """Lists what is compared with the first run: environment variables, and when the run is killed."""
     found: dict[str, tuple[dict[str, str], int | None]] = {"again": ({}, None), "killed": ({}, 120)}
     if jax.default_backend() == "cpu":
         given = os.environ.get("XLA_FLAGS", "")

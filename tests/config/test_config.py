@@ -114,7 +114,7 @@ def test_fields_are_assigned_by_name_and_only_optional_ones_take_none():
 
 @pytest.mark.parametrize(("env", "preset"), [pair for pair in ALL if pair[1] != "paper"])
 def test_methods_that_do_not_imitate_the_demonstration_see_what_they_see_at_test(env, preset):
-    """The last frame is all that a contextual policy looks at; a recurrent one must train on whole demonstrations."""
+    """Expects the last frame for a contextual policy and whole demonstrations for a recurrent one."""
     frames = {method: make_config(env, method, preset).train.support_frames for method in methods.METHODS}
     assert (frames["contextual"], frames["lstm"], frames["lstm_attention"]) == (1, None, None)
 

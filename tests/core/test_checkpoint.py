@@ -61,7 +61,7 @@ DAMAGES = {
 
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_every_file_of_the_newest_checkpoint_is_guarded(folder, tmp_path, damage):
-    """Whichever is damaged: that is said, the checkpoint before it is used, and nothing is thrown away."""
+    """Damages each file in turn: the damage is reported, the checkpoint before it is used, and nothing is lost."""
     assert len(files(folder)) > 8
     for i, name in enumerate(files(folder)):
         mine, reports = copy(folder, tmp_path / str(i) / "checkpoints"), []
@@ -99,7 +99,7 @@ def test_there_is_no_silent_start_from_nothing(folder, tmp_path):
 
 
 def test_a_full_disk_keeps_the_last_good_checkpoint_and_says_so(folder, tmp_path):
-    """A limit on the size of files stands for the disk: writing fails in the same place, with another number."""
+    """Limits the size of files in place of a full disk: writing fails in the same place, with another number."""
     mine, reports = copy(folder, tmp_path / "checkpoints"), []
     checkpoints = Checkpoints(mine, report=reports.append)
     before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
@@ -132,7 +132,7 @@ def test_an_error_of_the_disk_is_reported_with_its_reason(folder, tmp_path, monk
 
 
 def test_checkpoints_without_checksums_load(folder, tmp_path):
-    """Those of earlier versions."""
+    """Loads checkpoints of earlier versions."""
     mine, reports = copy(folder, tmp_path / "checkpoints"), []
     for step in ("10", "20"):
         (mine / step / "checksums.json").unlink()
@@ -186,7 +186,7 @@ def test_checksums_name_every_file(folder):
 
 
 def test_a_checkpoint_that_is_written_again_is_never_lost(tmp_path, monkeypatch):
-    """Killed before the new one is there, or without room for it: the old one is there."""
+    """Kills the writer before the new checkpoint is there, or leaves no room for it: the old one is there."""
     folder, reports = written(tmp_path / "checkpoints", [UNVALIDATED]), []
     checkpoints = Checkpoints(folder, report=reports.append)
 

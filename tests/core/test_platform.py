@@ -23,7 +23,7 @@ assert not xla_bridge.backends_are_initialized()
 
 
 def run(program, **environment):
-    """What a fresh process says, with XLA's flags as they are for users."""
+    """Returns what a fresh process prints, with XLA's flags as they are for users."""
     clean = {
         name: value for name, value in os.environ.items() if name not in ("XLA_FLAGS", "JAX_COMPILATION_CACHE_DIR")
     }
@@ -52,6 +52,6 @@ def test_configured_in_time_an_environment_is_content(tmp_path):
     ],
 )
 def test_what_came_too_late_is_said(calls, message):
-    """To compilers that need flags; later ones need none."""
+    """Warns for compilers that need flags; later ones need none."""
     code, _, error = run(f"{STATE}{calls}")
     assert (code == 1) == (f"RuntimeWarning: {message}" in error) == OLD

@@ -91,7 +91,7 @@ def test_the_description_counts_and_measures(tmp_path):
 
 
 def test_names_of_tasks_are_shown_as_they_are(tmp_path, capsys):
-    """Rich would take what is in brackets for its own."""
+    """Shows brackets, which Rich would take for its own."""
     with Writer(tmp_path / "set", (8, 8), 2, 2) as writer:
         for name, split in (("pick [the] cup", "train"), ("[/]", "test")):
             writer.add(name, split, [10], [good()])

@@ -27,7 +27,7 @@ def random_demo(length, state=4, image=(24, 32), action=2):
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
-    """A data set of three tasks; the second demonstration of the last one shows no actions."""
+    """Writes a data set of three tasks; the second demonstration of the last one shows no actions."""
     folder = tmp_path_factory.mktemp("data") / "set"
     demos = {name: [random_demo(length) for length in lengths] for name, lengths in LENGTHS.items()}
     demos["turn"][1] = dataclasses.replace(demos["turn"][1], action=None)
@@ -92,7 +92,7 @@ def test_nothing_outside_the_folder_is_read(written, tmp_path):
 
 
 def test_what_is_too_large_is_refused_before_there_is_memory_for_it(written, tmp_path):
-    """A header that promises much, and chunks that unpack to much; neither needs a large file."""
+    """Refuses a header that promises much and chunks that unpack to much; neither needs a large file."""
     folder, _ = written
     copy = shutil.copytree(folder, tmp_path / "set")
     header, array = copy / "zarr.json", copy / "00000" / "state" / "zarr.json"

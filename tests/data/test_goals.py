@@ -15,6 +15,6 @@ def test_without_a_height_the_goal_is_the_end():
 
 
 def test_with_a_height_it_is_where_the_hand_comes_down_until_it_has():
-    """It starts low and rises. The middle of its heights is 0.11: it is down from the fourth step on."""
+    """Starts low and rises. The middle of its heights is 0.11: the hand is down from the fourth step on."""
     expected = [[7.0, 3.0]] * 3 + [[np.nan, np.nan]] * 3
     np.testing.assert_array_equal(goals(STATE, (1, 0), 2), expected)

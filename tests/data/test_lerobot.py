@@ -28,7 +28,7 @@ def open_set(root=ROOT, camera=TOP, state="observation.state", action="action", 
 
 @pytest.fixture
 def copy(tmp_path):
-    """A copy of the fixture that a test may damage."""
+    """Copies the fixture, so that a test may damage it."""
     return pathlib.Path(shutil.copytree(ROOT, tmp_path / "copy"))
 
 
@@ -46,7 +46,7 @@ def change_episodes(root, column, value):
 
 
 def expected(episode, camera):
-    """[T, ...] images, states and actions as the script made them."""
+    """Makes [T, ...] images, states and actions as the script made them."""
     steps = range(make_lerobot.EPISODES[episode][1])
     top, wrist, state, action = map(np.stack, zip(*(make_lerobot.frame(episode, t) for t in steps), strict=True))
     return (top if camera == TOP else wrist), state, action
@@ -54,7 +54,7 @@ def expected(episode, camera):
 
 @pytest.mark.parametrize("camera", [TOP, WRIST])
 def test_every_episode_is_read_as_it_was_written(camera):
-    """Frames of the video belong to the same steps as states and actions, in whichever file they lie."""
+    """Pairs the video's frames with the steps of states and actions, in whichever file they lie."""
     found = open_set(camera=camera).episodes("task_index")
     assert [(e.task, e.length) for e in found] == [(make_lerobot.TASKS[t], n) for t, n in make_lerobot.EPISODES]
     for number, episode in enumerate(found):
@@ -124,7 +124,7 @@ def test_features_that_do_not_fit_are_refused(arguments, message):
 
 
 def test_a_value_that_is_stored_once_and_meant_often_is_refused(copy, monkeypatch):
-    """A dictionary makes a file of some kB of what is 320 MB in memory."""
+    """Builds a file of some kB, by a dictionary, of what is 320 MB in memory."""
     monkeypatch.setattr(dataset, "MAX_BYTES", 1 << 26)
     monkeypatch.setattr(lerobot, "_BATCH_BYTES", 1 << 24)
     path = copy / "meta/episodes/chunk-000/file-000.parquet"
@@ -150,7 +150,7 @@ def test_older_versions_name_the_converter(copy):
 
 @pytest.mark.parametrize("path", ["../../secret.parquet", "/etc/passwd", "{chunk_index.__class__}.parquet", "linked"])
 def test_nothing_outside_the_folder_is_read(copy, path):
-    """Neither by "..", nor by absolute paths, nor by links, and templates are no Python."""
+    """Refuses "..", absolute paths and links, and does not take templates for Python."""
     shutil.copy(ROOT / "data/chunk-000/file-000.parquet", copy.parent / "secret.parquet")
     (copy / "linked").symlink_to(copy.parent / "secret.parquet")
     change_info(copy, data_path=path)

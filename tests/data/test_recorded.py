@@ -15,7 +15,7 @@ DEMOS = [3, 2, 1, 4]
 
 
 def demo(task, number):
-    """Everything in it tells which task, demonstration and step it is."""
+    """Makes a demonstration in which every entry tells its task, its demonstration and its step."""
     length = 5 + 3 * number + task
     step = np.arange(length)
     code = np.stack([np.full(length, task), np.full(length, number), step], axis=1).astype(np.float32)

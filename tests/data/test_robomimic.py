@@ -29,7 +29,7 @@ def copy(tmp_path):
 
 
 def test_an_import_is_a_data_set(tmp_path):
-    """A task for each file, demonstrations in the order of their numbers, states side by side."""
+    """Makes a task of each file, with demonstrations in the order of their numbers and states side by side."""
     source = open_set(height=10)
     episodes.write(tmp_path / "out", source.episodes("file"), source.sizes, (0.0, 0.5), "there")
     data = DataSet(tmp_path / "out")

@@ -131,7 +131,7 @@ def test_cache_notices_other_arguments(trained, tmp_path, monkeypatch):
 
 
 def test_planning_that_was_killed_goes_on_with_the_next_part(trained, tmp_path, monkeypatch, capsys):
-    """24 demonstrations are planned 10 at once; the second part is damaged meanwhile."""
+    """Plans 24 demonstrations, 10 at once; the second part is damaged meanwhile."""
     perform, calls = demos_lib.perform, []
 
     def killed(*arguments):
@@ -154,7 +154,7 @@ def test_planning_that_was_killed_goes_on_with_the_next_part(trained, tmp_path, 
 
 
 def test_demonstrations_that_diverge_are_dropped_and_counted(trained, monkeypatch, capsys):
-    """The third of eight planned ones leaves the world, the fifth has no action any more."""
+    """Plans eight demonstrations, of which the third leaves the world and the fifth loses an action."""
     env, config = trained.run.env, dataclasses.replace(trained.config.data, plan_batch=8)
 
     def diverge(env, task, state, key, options, noise):
@@ -221,7 +221,7 @@ def test_rendered_states_are_the_robot_s(trained):
 
 @pytest.fixture(scope="module")
 def draw(trained):
-    """One-shot batches of MANY tasks with every state; images are left out, which spares their rendering."""
+    """Samples one-shot batches of MANY tasks with every state; images are left out, which spares their rendering."""
 
     def batch(key):
         drawn = demos_lib.sample_batch(trained.run.env, trained.train, jax.random.split(key, MANY), shots=1)
@@ -235,7 +235,7 @@ def draw(trained):
 
 
 def find(trained, demo):
-    """Task and demonstration in the training set with the actions [T, A], which no two share."""
+    """Finds task and demonstration in the training set with the actions [T, A], which no two share."""
     gap = np.abs(np.asarray(trained.train.action) - np.asarray(demo.action)).max(axis=(-2, -1))
     assert (gap == 0).sum() == 1
     return np.unravel_index(gap.argmin(), gap.shape)
@@ -262,7 +262,7 @@ def test_support_and_query_are_different_demonstrations_of_one_task(trained, dra
 
 
 def test_only_successful_demonstrations_are_drawn(trained):
-    """Of the first task one fails, of the second two: its third has no partner, so the task is never drawn."""
+    """Lets one demonstration of the first task fail and two of the second, whose third has no partner."""
     success = jnp.ones((8, 3), bool).at[0, 1].set(False).at[1, 1:].set(False)
     demos, env = dataclasses.replace(trained.train, success=success), trained.run.env
     batch = jax.jit(lambda keys: demos_lib.sample_batch(env, demos, keys, 1, 1, 1))(

@@ -35,7 +35,7 @@ print(json.dumps(sorted({name.split(".")[0] for name in sys.modules})))
 
 
 def make_policy(method="mil", **settings):
-    """An untrained policy for small images, whose whitening is not the identity."""
+    """Makes an untrained policy for small images, whose whitening is not the identity."""
     env = milx.make("reach", (16, 20))
     config = make_config("reach", method, "cpu")
     config.env.image_shape = (16, 20)

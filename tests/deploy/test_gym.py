@@ -28,7 +28,7 @@ def test_the_checker_of_gymnasium_is_content(gym_env):
 
 
 def test_an_episode_is_the_environments(gym_env):
-    """States, images, rewards and success, step by step."""
+    """Compares states, images, rewards and success, step by step."""
     env, rng = gym_env.env, np.random.default_rng(0)
     observation, _ = gym_env.reset(seed=4)
     task, states = gym_env._task, [gym_env._states[0]]
@@ -60,7 +60,7 @@ def test_seeds_repeat_and_the_task_can_stay(gym_env):
 
 
 def test_a_demonstration_is_of_the_same_task_in_another_scene(gym_env, monkeypatch):
-    """The planner, which has tests of its own, is replaced by one who stands still and says what it was asked."""
+    """Replaces the planner, which has tests of its own, by one that stands still and records what it was asked."""
     asked = {}
 
     def stand_still(env, task, scene, key, options, noise):

@@ -24,7 +24,7 @@ def policy(trained):
 
 @pytest.fixture(scope="module")
 def demo(trained):
-    """A held-out demonstration, [1, T, ...]."""
+    """Returns a held-out demonstration, [1, T, ...]."""
     first = jax.tree.map(lambda x: x[0], (trained.test.task, trained.test.states, trained.test.action))
     states, action = jax.tree.map(lambda x: x[0], first[1:])
     seen = jax.jit(lambda *args: render_demo(trained.run.env, *args))(first[0], states, action)
@@ -37,7 +37,7 @@ def task_params(policy, demo):
 
 
 def good_demo():
-    """[T, ...] NumPy arrays of the right shapes and types."""
+    """Returns [T, ...] NumPy arrays of the right shapes and types."""
     rng = np.random.default_rng(0)
     return milx.Demo(
         image=rng.integers(0, 256, (T, H, W, 3), dtype=np.uint8),

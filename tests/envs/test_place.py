@@ -39,7 +39,7 @@ def task(env):
 
 
 def c_model(model, ours):
-    """MuJoCo's own model with the geoms of one of MJX."""
+    """Compiles MuJoCo's own model with the geoms of one of MJX."""
     model = copy.copy(model)
     for name in ("geom_pos", "geom_quat", "geom_size"):
         getattr(model, name)[:] = getattr(ours, name)
@@ -55,7 +55,7 @@ class Arm:
         self.tip, self.hand = self.model.site("tip").id, self.model.body("hand").id
 
     def at(self, qpos):
-        """Position of the tip, axes of the hand and the Jacobian."""
+        """Returns the position of the tip, the axes of the hand, and the Jacobian."""
         self.data.qpos[:] = qpos
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_comPos(self.model, self.data)
@@ -72,7 +72,7 @@ def test_the_hand_and_its_jacobian_are_those_of_mujoco(env):
 
 
 def test_an_episode_of_motion_is_that_of_mujoco_with_numpy(env, task):
-    """Damped least squares on C MuJoCo's Jacobian; hard turns drive joints into their limits."""
+    """Steps damped least squares on C MuJoCo's Jacobian; hard turns drive joints into their limits."""
     start = env.reset(jax.random.key(1), task)
     rng = np.random.default_rng(1)
     actions = np.clip(np.linspace(-1.5, 1.5, 6) + 0.3 * rng.normal(size=(env.horizon, 6)), -2, 2)
@@ -92,7 +92,7 @@ def test_an_episode_of_motion_is_that_of_mujoco_with_numpy(env, task):
 
 
 def test_what_is_planned_is_what_its_version_says(env, task):
-    """Tasks, scenes, guesses, physics and costs; the planner itself is in the test of reach's experts."""
+    """Compares tasks, scenes, guesses, physics and costs; the planner itself is in the test of reach's experts."""
 
     @jax.jit
     def look(task, key):
@@ -119,7 +119,7 @@ def test_a_small_action_moves_the_hand_at_the_speed_it_asks_for(env, task):
 
 
 def held_over(env, task, key, offset=(0.0, 0.0)):
-    """A state with the hand pointing down over the target, so far off its middle (m), at the height of release."""
+    """Points the hand down over the target, `offset` (m) off its middle, at the height of release."""
     state = env.reset(key, task)
     arm, qpos = Arm(env), np.array(place._START)
     goal = np.array(state.mocap_pos[task.target])
@@ -142,7 +142,7 @@ def fall(env, tasks, states):
 
 @pytest.fixture(scope="module")
 def dropped(env):
-    """Every container with a thing of its split, let go over its middle, and where that comes to rest."""
+    """Drops a thing of its split over the middle of every container, and returns where it comes to rest."""
     tasks, states = [], []
     for i, name in enumerate(CONTAINERS):
         split = next(split for split, names in containers.SPLITS.items() if name in names)
@@ -169,7 +169,7 @@ def test_what_is_let_go_over_the_middle_of_a_container_comes_to_rest_in_it(env, 
 
 
 def test_the_fall_is_that_of_mujoco(env, dropped):
-    """Where it comes to rest, and that it does within the rim; contacts differ, as MJX finds fewer points on a box."""
+    """Compares where things come to rest, and that they do within the rim; contacts with boxes differ."""
     tasks, states, (fallen, _) = dropped
     off, within = [], []
     for i in range(len(tasks.target)):
@@ -194,7 +194,7 @@ def test_the_fall_is_that_of_mujoco(env, dropped):
 
 
 def test_only_what_lies_still_within_the_targets_rim_counts(env, task):
-    """By the ellipse of a round rim, by the rectangle of a square one."""
+    """Compares with the ellipse of a round rim and with the rectangle of a square one."""
 
     class Fallen(Place):
         def __init__(self):
@@ -279,7 +279,7 @@ def test_containers_that_cannot_be_built_are_refused():
 
 
 def test_the_thing_hangs_from_the_tip_and_stays_in_the_hand(env, task):
-    """Its highest visible point is at the tip, whatever its shape."""
+    """Finds the highest visible point at the tip, whatever the shape."""
     state = held_over(env, task, jax.random.key(6))
     for name in ("lighthouse", "letter_a", "car"):
         chosen = dataclasses.replace(task, thing=jnp.int32(list(SHAPES).index(name)))

@@ -87,7 +87,7 @@ def test_the_state_is_that_of_mujocos_arm(env):
 
 
 def test_calibration_tells_where_in_the_image_a_container_stands(env, task):
-    """The target's pixels, found by drawing it in another color, have their center where the calibration puts it."""
+    """Finds the target's pixels by drawing it in another color; their center is where the calibration puts it."""
     plain = dataclasses.replace(task, texture=task.texture._replace(family=jnp.zeros(4, jnp.int32)))
     looks = [dataclasses.replace(plain, color=plain.color.at[1].set(level)) for level in (0.1, 0.9)]
     render, state = jax.jit(env.render), env.reset(jax.random.key(9), task)

@@ -42,7 +42,7 @@ def task(env):
 
 
 def c_model(env, task):
-    """MuJoCo's own model of the task."""
+    """Compiles MuJoCo's own model of the task."""
     model, ours = copy.copy(env.mj_model), env.model_of(task)
     for name in ("geom_pos", "geom_quat", "geom_size", "body_mass", "body_inertia", "dof_damping"):
         getattr(model, name)[:] = getattr(ours, name)
@@ -104,21 +104,21 @@ def test_an_episode_of_pushing_is_that_of_mujoco(env, task, touched):
 
 @pytest.fixture(scope="module")
 def shown(env):
-    """Tasks, and demonstrations of them by the controller with noise on its actions."""
+    """Samples tasks, and demonstrations of them by the controller with noise on its actions."""
     tasks = jax.vmap(env.sample_task, in_axes=(0, None))(jax.random.split(jax.random.key(8), 32), "train")
     scenes, keys = scenes_of(env, tasks)
     return tasks, *perform(env, tasks, scenes, keys, Options(iterations=0), 0.1)
 
 
 def test_what_is_planned_is_what_its_version_says(env, shown):
-    """Tasks, scenes, physics, controller, tactics and noise: the first demonstration, at every tenth step."""
+    """Compares tasks, scenes, physics, controller, tactics and noise: the first demonstration, at every tenth step."""
     tasks, states, actions = shown
     seen = tasks.shape[0], tasks.size[0], states.qpos[0, ::10], actions[0, ::10]
     planned.check("push", [env.version, VERSION], np.concatenate([np.ravel(x) for x in seen]), atol=1e-4)
 
 
 def scenes_of(env, tasks):
-    """A scene of each task, and a key for its noise."""
+    """Resets each task to a scene, and makes a key for its noise."""
     keys = jax.random.split(jax.random.key(9), len(tasks.target))
     return jax.vmap(env.reset)(keys, tasks), keys
 
@@ -129,7 +129,7 @@ def test_the_controller_pushes_most_objects_to_the_goal_in_spite_of_noise(env, s
 
 
 def test_a_tactic_is_how_far_to_the_side_of_the_objects_center_the_hand_meets_it(env, shown, monkeypatch):
-    """To the left, as the hand looks at the goal. Of 32 means, on an arm shaken by noise, 4 mm are three deviations."""
+    """Measures to the left of the hand's view of the goal. Of 32 means under noise, 4 mm are three deviations."""
     tasks, _, _ = shown
     scenes, keys = scenes_of(env, tasks)
     rows, met = np.arange(len(keys)), []
@@ -159,7 +159,7 @@ def test_demonstrations_record_the_controllers_answers_before_the_noise(env, sho
 
 
 def test_the_goal_of_a_demonstration_lies_behind_its_target_until_it_is_pushed(env, shown):
-    """What the goal head is to see in the image: near the target, farther from the disc than the target is."""
+    """Compares what the goal head is to see: a place near the target, farther from the disc than the target is."""
     tasks, states, _ = shown
     robot = jax.jit(jax.vmap(jax.vmap(env.robot_state)))(states)
     goal = jax.vmap(lambda state: goals(state, env.goal_indices, env.height_index))(robot)[:, 0]
@@ -173,7 +173,7 @@ def test_the_goal_of_a_demonstration_lies_behind_its_target_until_it_is_pushed(e
 
 
 def test_the_hand_starts_low_enough_for_every_shape(env, task):
-    """Where the prongs end above a capsule's axis the hand would be lifted instead of pushing."""
+    """Checks that no prong ends above a capsule's axis, where the hand would be lifted instead of pushing."""
     data = mujoco.MjData(env.mj_model)
     data.qpos[:] = env.reset(jax.random.key(1), task).qpos
     mujoco.mj_kinematics(env.mj_model, data)
@@ -271,7 +271,7 @@ def test_the_released_codes_criterion_counts_steps_within_a_wider_circle(env, ta
     x = NUM_JOINTS + 3 * task.target
 
     def counts(steps, distance):
-        """Whether it counts by either criterion if the target is so far from the goal in these time steps."""
+        """Tells whether either criterion counts a target that is so far from the goal in these time steps."""
         far = jnp.full(env.horizon + 1, 0.5).at[steps].set(distance)
         qpos = jnp.broadcast_to(start.qpos, (env.horizon + 1, len(start.qpos))).at[:, x].set(far).at[:, x + 1].set(0)
         states = State(qpos, jnp.zeros_like(qpos), jnp.zeros((env.horizon + 1, 0, 3)))

@@ -35,14 +35,14 @@ def task(env):
 
 @pytest.fixture(scope="module")
 def actions(env):
-    """Random controls; half of the episodes go beyond the range, where the environment clips."""
+    """Samples controls; half of the episodes go beyond the range, where the environment clips."""
     scale = np.array([0.2, 1.0, 1.5, 3.0])[:, None, None]
     return scale * np.random.default_rng(0).uniform(-1, 1, (EPISODES, env.horizon, env.action_size))
 
 
 @pytest.fixture(scope="module")
 def states(env, task, actions):
-    """States [EPISODES, T + 1] under the actions, and what the robot knows in them."""
+    """Returns states [EPISODES, T + 1] under the actions, and what the robot knows in them."""
 
     @jax.jit
     @jax.vmap
@@ -82,7 +82,7 @@ def test_same_controls_give_the_trajectory_of_c_mujoco(env, actions, states):
 
 
 def test_the_planner_s_step_is_close_to_the_exact_one(env, task, actions, states):
-    """One step of the midpoint method is off by the third power of its length; the planner needs its Jacobians."""
+    """Bounds the error of one step of the midpoint method, which falls with the third power of its length."""
     states, _ = states
     inside = np.abs(actions).max(axis=(1, 2)) < 0.5
     x = np.asarray(jnp.concatenate([states.qpos, states.qvel], axis=-1))[inside, :-1].reshape(-1, 4)
@@ -98,7 +98,7 @@ def test_the_planner_s_step_is_close_to_the_exact_one(env, task, actions, states
 
 
 def test_jacobians_of_an_action_are_differences_of_c_mujoco(env, task, states):
-    """Central differences with steps of 1e-6 are off by about 1e-12 / 1e-6 from rounding, and less from curvature."""
+    """Compares with central differences of step 1e-6, whose rounding error is about 1e-12 / 1e-6."""
     states, _ = states
     scene = env.reset(jax.random.key(4), task)
     model, data = env.mj_model, mujoco.MjData(env.mj_model)
@@ -122,7 +122,7 @@ def test_jacobians_of_an_action_are_differences_of_c_mujoco(env, task, states):
 
 
 def test_float32_follows_c_mujoco_through_an_episode(env, task, actions, states):
-    """What ships: 1,000 Runge-Kutta steps round off to less than a tenth of a millimetre at the fingertip."""
+    """Follows 1,000 Runge-Kutta steps in what ships: they round off to less than 0.1 mm at the fingertip."""
     exact, _ = states
     with jax.enable_x64(False):
         single = milx.make("reach", IMAGE_SHAPE)
@@ -172,7 +172,7 @@ def test_state_reach_tells_the_robot_s_state_and_the_cubes_by_number(env, task):
 
 @pytest.fixture(scope="module")
 def succeeds(env, task):
-    """(set of steps, gap in m) -> success of an episode whose fingertip is the gap from the target in those steps.
+    """Makes a function of (set of steps, gap in m): success of an episode with the fingertip that far off then.
 
     In all other steps the fingertip touches a distractor, 0.3 m away.
     """
@@ -207,7 +207,7 @@ def test_success_is_closer_than_five_centimetres(succeeds):
 
 
 def pixel(point):
-    """(row, column) of a point in the world: the camera looks down from 1.2 m with 24 degrees from top to bottom."""
+    """Returns (row, column) of a point: the camera looks down from 1.2 m with 24 degrees from top to bottom."""
     height, width = IMAGE_SHAPE
     per_metre = height / (2 * np.tan(np.deg2rad(12)) * (1.2 - point[2]))
     return int(height / 2 - per_metre * point[1]), int(width / 2 + per_metre * point[0])

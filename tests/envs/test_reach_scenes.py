@@ -34,7 +34,7 @@ def task(env):
 
 @pytest.fixture(scope="module")
 def tasks(env):
-    """4,000 tasks of every split."""
+    """Samples 4,000 tasks of every split."""
     keys = jax.random.split(jax.random.key(2), 4000)
     return {
         split: jax.jit(jax.vmap(lambda key, split=split: env.sample_task(key, split)))(keys)
@@ -111,7 +111,7 @@ def test_a_redrawn_scene_moves_only_the_distractors_to_where_reset_would_put_the
 
 
 def test_calibration_tells_where_in_the_image_a_cube_stands(env):
-    """The cube's pixels, found by drawing it in another color, have their center where the calibration puts it."""
+    """Finds the cube's pixels by drawing it in another color; their center is where the calibration puts it."""
     spots = np.random.default_rng(0).uniform(-0.19, 0.19, (6, 2))
     image_to_goal = env.image_to_goal
     for spot in spots:
@@ -142,7 +142,7 @@ def test_scenes_keep_their_distances_and_the_arm_starts_at_zero(env, task):
 
 
 def test_scenes_are_uniform_under_the_distance_rule(env, task):
-    """The mean distance between two cubes is that of rejection sampling in NumPy."""
+    """Compares the mean distance between two cubes with that of rejection sampling in NumPy."""
     positions = np.random.default_rng(0).uniform(-0.2, 0.2, (100_000, 3, 2))
     gaps = np.linalg.norm(positions[:, [0, 0, 1]] - positions[:, [1, 2, 2]], axis=-1)
     expected = gaps[gaps.min(axis=-1) >= 0.15]

@@ -68,7 +68,7 @@ def test_every_shape_is_centered_and_what_is_only_seen_stands_on_its_outline(nam
 
 
 def rim(primitive):
-    """[N, 2] points of a detail's edge, seen from above."""
+    """Samples [N, 2] points of a detail's edge, seen from above."""
     if isinstance(primitive, Box):
         corners = np.array([[i * primitive.a, j * primitive.b] for i in (-1, 1) for j in (-1, 1)])
         turn = np.array(

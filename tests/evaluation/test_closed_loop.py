@@ -57,7 +57,7 @@ def test_a_result_counts_trials_by_every_criterion_and_has_floors_beside_each():
 
 
 def test_bootstrap_interval_is_over_things_and_not_over_trials():
-    """Where trials agree with those of the same thing, its percentiles are the binomial's of so many things."""
+    """Compares with the binomial's percentiles for as many objects, where trials of one object agree."""
     kind = np.random.default_rng(1).permutation(np.repeat(np.arange(16), 10))
     success = np.repeat((kind < 8)[:, None], 6, axis=1)
     expected = scipy.stats.binom(16, 0.5).ppf([0.025, 0.975]) / 16

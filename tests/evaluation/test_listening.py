@@ -78,7 +78,7 @@ def test_errors_are_those_of_a_loop_over_the_tasks(batch, most):
 
 
 def test_an_entry_that_never_changes_has_a_finite_error(batch):
-    """It is divided by the least variance of the whitening, 1e-6."""
+    """Divides by the least variance of the whitening, 1e-6."""
     still = dataclasses.replace(batch.query, action=batch.query.action.at[..., 1].set(0.5))
     shown = dataclasses.replace(batch.support, action=batch.support.action.at[..., 1].set(0.503))
     found = measure(Mean(), jnp.zeros(ACTION), TaskBatch(shown, still))
@@ -97,7 +97,7 @@ CONSTANT = PolicyNetwork(
 
 
 def test_the_size_of_the_step_is_relative_to_the_tensor(batch):
-    """An inner step moves a constant policy by 2 alpha / A of the way to the demonstration's mean action."""
+    """Moves a constant policy by 2 alpha / A of the way to the demonstration's mean action."""
     alpha = 0.1
     method = MIL(MILConfig(inner_lr=alpha, inner_clip=1e9), CONSTANT)
     found = measure(method, {"policy": {"a": jnp.asarray(THETA)}, "whitening": PLAIN}, batch)
@@ -137,7 +137,7 @@ def test_a_run_imitates_first_and_measures_the_batch_that_comes_next(batch):
 
 
 def test_progress_counts_the_updates_with_an_inner_step(batch):
-    """The multi-step loss has equal weights in the first of them, whenever that is."""
+    """Expects equal weights of the multi-step loss in the first update with an inner step, whenever that is."""
     config = MILConfig(inner_lr=0.1, inner_clip=1e9, inner_steps=2, variant="multi_step", imitation_steps=6)
     method = MIL(config, CONSTANT)
     params = {"policy": {"a": jnp.asarray(THETA)}, "whitening": PLAIN}

@@ -14,7 +14,7 @@ import cells
 
 
 def test_a_cell_is_a_run(trained, tmp_path, monkeypatch):
-    """Same seeds, tasks and trials: the same success, demonstrations and baselines, to the last bit, killed or not."""
+    """Compares success, demonstrations and baselines to the last bit: same seeds, tasks and trials, killed or not."""
     monkeypatch.setattr(cells.envs, "make", lambda *_: trained.run.env)  # spares what is compiled for it
     runner, config = cells.Cells(tmp_path, trained.config.data.tasks), tiny_config()
     saved = []

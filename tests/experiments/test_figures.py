@@ -81,7 +81,7 @@ def test_pages_show_what_the_result_files_hold(flags):
 
 @pytest.fixture
 def flags():
-    """The scripts' flags, parsed; what a test sets is undone."""
+    """Parses the scripts' flags, and undoes what a test sets."""
     from absl import flags
 
     saved = flags.FLAGS

@@ -38,7 +38,7 @@ def random_whitening(rng):
 
 @functools.cache
 def random_params(**network):
-    """A tiny network and parameters that are nowhere zero."""
+    """Makes a tiny network and parameters that are nowhere zero."""
     policy = make_policy(PolicyConfig(**TINY | network), IMAGE_SHAPE, STATE, ACTION, len(GOAL_INDICES))
     rng = np.random.default_rng(1)
     draw = lambda leaf: jnp.asarray(leaf + 0.2 * rng.standard_normal(leaf.shape))  # noqa: E731
@@ -46,7 +46,7 @@ def random_params(**network):
 
 
 def build(network=None, **config):
-    """MIL on a tiny network, and its parameters."""
+    """Makes MIL on a tiny network, and its parameters."""
     policy, theta = random_params(**network or {})
     rng = np.random.default_rng(2)
     params = {"policy": theta, "whitening": random_whitening(rng)}
@@ -56,7 +56,7 @@ def build(network=None, **config):
 
 
 def assert_trees_close(found, expected):
-    """Equal up to 1e-6 of each tensor's largest entry: images enter in float32, which two programs may round apart."""
+    """Asserts equality up to 1e-6 of each tensor's largest entry: programs round float32 images differently."""
     close = lambda a, b: np.testing.assert_allclose(a, b, rtol=0, atol=1e-6 * np.abs(b).max())  # noqa: E731
     jax.tree.map(close, found, expected)
 
@@ -66,7 +66,7 @@ def difference(after, before):
 
 
 def random_batch():
-    """A meta-batch of random demonstrations."""
+    """Samples a meta-batch of demonstrations."""
     rng = np.random.default_rng(0)
     return TaskBatch(support=random_demos(rng, TASKS, 1), query=random_demos(rng, TASKS, 2))
 

@@ -22,7 +22,7 @@ CASES += [(name, False) for name in ("mil", "contextual", "lstm", "lstm_attentio
 
 @functools.cache
 def build(name, vision, goal_head=False):
-    """A tiny method that sees pixels or only states, and its parameters; whitening changes nothing."""
+    """Makes a tiny method that sees pixels or only states, and its parameters; whitening changes nothing."""
     spec = Spec(
         image_shape=IMAGE_SHAPE if vision else None,
         state_size=STATE,
@@ -56,7 +56,7 @@ def random_demos(rng, vision, *shape):
 
 @functools.cache
 def two_tasks(vision):
-    """Two tasks with different demonstrations; the queries show the same, but ask for other actions."""
+    """Makes two tasks with different demonstrations; the queries show the same, but ask for other actions."""
     rng = np.random.default_rng(0)
     support, query = random_demos(rng, vision, 2, 1), random_demos(rng, vision, 2, 1)
     same = jax.tree.map(lambda x: jnp.stack([x[0], x[0]]), query)
@@ -65,7 +65,7 @@ def two_tasks(vision):
 
 @functools.cache
 def trained(name, vision):
-    """The parameters after they were fitted to the two tasks."""
+    """Fits the parameters to the two tasks."""
     method, params = build(name, vision)
     batch, optimizer = two_tasks(vision), optax.adam(3e-3)
 
@@ -81,7 +81,7 @@ def trained(name, vision):
 
 @pytest.mark.parametrize(("name", "vision"), CASES)
 def test_a_method_fits_two_tasks_and_with_swapped_demonstrations_does_the_other(name, vision):
-    """No observation tells the two tasks apart: blind, a policy errs by a quarter of their squared difference.
+    """Compares with a blind policy, which errs by a quarter of the tasks' squared difference.
 
     Fitted, it errs by nothing; told the other task, it does the other, and errs by the whole difference.
     """
@@ -96,7 +96,7 @@ def test_a_method_fits_two_tasks_and_with_swapped_demonstrations_does_the_other(
 
 @pytest.mark.parametrize(("name", "vision"), CASES)
 def test_the_action_is_the_one_that_the_loss_knows(name, vision):
-    """`adapt` and `act` outside, `loss` inside: the errors of the acted actions are the loss."""
+    """Compares the errors of the actions that `adapt` and `act` choose with `loss`."""
     method, params = build(name, vision)
     batch = two_tasks(vision)
 

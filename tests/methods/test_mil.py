@@ -158,7 +158,7 @@ def test_closed_form_of_the_learned_rates_gradient(constant_case, first_order):
 
 
 def test_closed_form_of_the_clipped_step(constant_case):
-    """Where the clip holds, the step is alpha times the clip and no longer depends on theta: the factor is one."""
+    """Expects a factor of one where the clip holds: the step is alpha times the clip and does not depend on theta."""
     params, batch, a, b = constant_case
     inner = SLOPE * (THETA - a)
     clip = float(np.median(np.abs(inner)))

@@ -46,7 +46,7 @@ def batch(float64):
 
 
 def test_a_video_teaches_the_goal_that_hindsight_sees_in_its_first_and_last_image(batch):
-    """One vote, theta, of deviation one: the inner gradient is the vote minus that goal, whatever the states are.
+    """Makes one vote, theta, of deviation one: the inner gradient is the vote minus that goal, whatever the states are.
 
     The head sees with unadapted parameters in the inner step and in the loss.
     """
@@ -154,7 +154,7 @@ def test_with_rate_zero_the_loss_is_plain_imitation_of_the_query(batch):
 
 
 def test_a_small_step_lowers_the_inner_loss_by_its_gradients_square(batch):
-    """L(theta - alpha g) = L(theta) - alpha |g|^2 + O(alpha^2)."""
+    """Compares with L(theta - alpha g) = L(theta) - alpha |g|^2 + O(alpha^2)."""
     method, params = build({"heads": 2, "goal_head": True}, inner_lr=1e-6, goal_weight=0.7)
     support = jax.tree.map(lambda x: x[0], batch.support)
 
@@ -207,7 +207,7 @@ NOT_SEEN = {"video+state": ("action",), "video": ("action", "state", "goal")}
 
 @pytest.mark.parametrize(("given", "hindsight"), [("video+state", False), ("video", False), ("video", True)])
 def test_what_is_not_given_of_a_demonstration_does_not_matter(batch, given, hindsight):
-    """Nor need it be there; all else matters, in the inner step of a learned loss as in a context."""
+    """Leaves it out or changes it; all else matters, in the inner step of a learned loss as in a context."""
     network = {"learned_loss": "linear", "goal_head": True, "hindsight_head": hindsight}
     method, params = build(network, given=given, goal_weight=0.7)
     demo, other = (jax.tree.map(lambda x, n=n: x[n], batch.support) for n in range(2))
@@ -240,7 +240,7 @@ def test_with_two_heads_the_inner_step_leaves_the_head_that_acts(batch):
 
 
 def test_imitating_its_own_actions_is_without_loss(batch):
-    """`act` undoes the whitening that the loss applies, and uses the head that the outer loss trains."""
+    """Checks that `act` undoes the loss's whitening, and uses the head that the outer loss trains."""
     method, params = build({"heads": 2})
     task_params = jax.jit(method.adapt)(params, jax.tree.map(lambda x: x[0], batch.support))
     demo = jax.tree.map(lambda x: x[0], batch.query)

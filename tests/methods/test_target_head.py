@@ -30,7 +30,7 @@ def float64():
 
 @pytest.fixture(scope="module")
 def case():
-    """MIL with a target head, its parameters, and one demonstration with all axes."""
+    """Makes MIL with a target head, its parameters, and one demonstration with all axes."""
     rng = np.random.default_rng(0)
     config = PolicyConfig(filters=(4,), strides=(2,), fc_layers=(8,), target_head=True)
     network = make_policy(config, IMAGE_SHAPE, STATE, ACTION, len(INDICES))
@@ -81,7 +81,7 @@ def test_listening_remembers_the_first_image(case):
 
 
 def test_policies_with_a_memory_act_step_by_step(case, tmp_path):
-    """The policy, and its export, act as in the loop; without their memory they do not act at all."""
+    """Compares the policy and its export with the loop; without their memory they do not act at all."""
     method, _, demo = case
     config = assemble.default_config("mil")
     config.recorded.path, config.recorded.horizon = "a data set", STEPS

@@ -47,7 +47,7 @@ CONSTANT = PolicyNetwork(
 
 
 def squared_error(theta, action):
-    """Equation 2 of a constant policy."""
+    """Computes equation 2 of a constant policy."""
     return np.mean(M**2 * (np.asarray(theta)[..., None, None, :] - np.asarray(action)) ** 2)
 
 

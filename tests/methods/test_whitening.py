@@ -16,7 +16,7 @@ def float64():
 
 @pytest.fixture
 def data():
-    """States [3, 4, 5, 6] and actions [3, 4, 5, 2] with very different scales."""
+    """Samples states [3, 4, 5, 6] and actions [3, 4, 5, 2] of very different scales."""
     rng = np.random.default_rng(0)
     state = np.logspace(-2, 3, 6) * rng.standard_normal((3, 4, 5, 6)) + np.arange(6)
     return state, 0.2 * rng.standard_normal((3, 4, 5, 2)) + [0.5, -3.0]

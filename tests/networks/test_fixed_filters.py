@@ -31,7 +31,7 @@ def write(path, weight=WEIGHT, **more):
 
 @pytest.mark.parametrize("kind", ["npz", "safetensors"])
 def test_vggs_layer_sees_the_normalized_image(kind, tmp_path):
-    """SciPy's correlation of the image as VGG-19 wants it, away from the border."""
+    """Compares with SciPy's correlation of the image as VGG-19 expects it, away from the border."""
     filters = fixed_filters.read_filters(write(tmp_path / f"vgg.{kind}", other=np.zeros(2)), CONFIG)
     image = RNG.uniform(size=(12, 14, 3))
     normal = (image - fixed_filters.MEAN) / fixed_filters.STD
@@ -58,7 +58,7 @@ def test_files_that_hold_something_else_are_refused(tmp_path):
 
 
 def scene(seed):
-    """Images with vertical edges and red spots."""
+    """Draws images with vertical edges and red spots."""
     rng = np.random.default_rng(seed)
     images = np.full((20, 24, 24, 3), 60, np.uint8)
     images[:, :, 12:] = 200

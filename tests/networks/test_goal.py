@@ -14,7 +14,7 @@ LOG_STD = -0.4
 
 
 def likelihoods(weight, vote, goal):
-    """[B, P]: every position's share of the density of every goal, from SciPy."""
+    """Computes [B, P], every position's share of the density of every goal, by SciPy."""
     normal = [multivariate_normal(mean, np.exp(2 * LOG_STD)) for mean in vote]
     return weight * np.stack([n.pdf(goal) for n in normal], axis=-1)
 
@@ -48,7 +48,7 @@ def test_gradient_in_the_filter_is_the_mean_feature_less_the_feature_where_the_g
 
 
 def test_gradient_in_the_weights_of_states_votes_is_their_prior_less_their_posterior(rng):
-    """Each state has its own votes, all states share their weights; from equal weights a step favors what was near."""
+    """Gives each state its own votes and all states the same weights; a step favors what was near."""
     state, goal = rng.standard_normal((BATCH, 7)), rng.standard_normal((BATCH, GOAL))
     head = StateGoalHead(GOAL)
     params = head.init(jax.random.key(0), jnp.asarray(state))["params"]

@@ -60,7 +60,7 @@ def test_blocks_in_bfloat16_are_as_exact_as_their_products(rng):
 
 @pytest.mark.parametrize("filters", [2, 40])
 def test_blocks_that_are_put_side_by_side_or_added_give_the_same(rng, filters):
-    """With 3 channels and stride 2, blocks are put side by side for more than 12 filters, and added otherwise."""
+    """Covers both: with 3 channels and stride 2, blocks are put side by side for more than 12 filters."""
     x, kernel = rng.standard_normal((2, 9, 12, 3)), rng.standard_normal((3, 3, 3, filters))
     found = layers.convolve_blocks(jnp.asarray(x), jnp.asarray(kernel), 2)
     np.testing.assert_allclose(found, reference_conv2d(x, kernel, 2), atol=1e-12)
@@ -95,7 +95,7 @@ def test_soft_argmax_of_a_uniform_image_is_the_middle():
 
 
 def test_soft_argmax_moves_with_the_image(rng):
-    """A blob on a zero image whose weight exp(0) is negligible: one pixel further is 2 / (size - 1) further."""
+    """Moves a blob on a zero image, where exp(0) is negligible, by a pixel: 2 / (size - 1) further."""
     height, width = 12, 14
     features = np.zeros((1, height, width, 4))
     features[0, 3:7, 2:6] = rng.uniform(60, 63, (4, 4, 4))

@@ -19,7 +19,7 @@ def inputs():
 
 
 def build(**changes):
-    """A tiny network, and parameters that are nowhere zero."""
+    """Makes a tiny network, and parameters that are nowhere zero."""
     network = make_policy(PolicyConfig(**TINY | changes), IMAGE_SHAPE, STATE, ACTION, GOAL)
     leaves, tree = jax.tree.flatten(jax.jit(network.init)(jax.random.key(0)))
     rng = np.random.default_rng(1)
@@ -28,12 +28,12 @@ def build(**changes):
 
 
 def with_layers(params, **layers):
-    """The parameters with other layers in the controller."""
+    """Replaces the layers of the controller in the parameters."""
     return {**params, "controller": {**params["controller"], **layers}}
 
 
 def test_bias_transformation_gives_the_first_bias_a_learned_step(inputs):
-    """Paper, Section 4.1: with z the vector and W its rows of the first layer, z W + b is the layer's bias.
+    """Compares with Section 4.1 of the paper: for z and its rows W of the first layer, z W + b is the layer's bias.
 
     A gradient step of rate alpha on (z, W) moves z W by -alpha g (W^T W + |z|^2) + O(alpha^2), where g is the loss's
     gradient by b: a step through a learned matrix, where b alone would move by -alpha g.
@@ -77,7 +77,7 @@ def test_without_bias_transformation_nothing_of_it_is_left(inputs):
 
 @pytest.mark.parametrize("changes", [{}, {"soft_argmax": True, "goal_head": True}])
 def test_examples_of_a_batch_do_not_see_each_other(inputs, changes):
-    """Layer norm, unlike batch norm, acts within an example: a batch is a loop over its examples."""
+    """Compares a batch with a loop over its examples: layer norm, unlike batch norm, acts within an example."""
     network, params = build(**changes)
 
     def answer(*inputs):

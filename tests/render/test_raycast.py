@@ -18,7 +18,7 @@ SOLIDS = ("sphere", "capsule", "ellipsoid", "cylinder", "box")
 
 
 def random_scene(seed: int) -> str:
-    """Two of every solid in random poses above an infinite floor, and two finite planes that face the camera."""
+    """Draws two of every solid in random poses above an infinite floor, and two finite planes that face the camera."""
     rng = np.random.default_rng(seed)
     bodies = ""
     for kind in 2 * SOLIDS:
@@ -41,7 +41,7 @@ def random_scene(seed: int) -> str:
 
 
 def mujoco_rays(model, data, directions):
-    """Geom ids, distances (in lengths of the directions) and normals along the directions [H, W, 3] from the camera."""
+    """Casts MuJoCo's rays along directions [H, W, 3]: geom ids, distances (in their lengths) and normals."""
     geom_id, distance = np.full((HEIGHT, WIDTH), -1), np.full((HEIGHT, WIDTH), np.inf)
     normal = np.zeros((HEIGHT, WIDTH, 3))
     shown = np.array([1, 1, 1, 0, 0, 0], np.uint8)

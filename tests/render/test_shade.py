@@ -15,7 +15,7 @@ RGB = np.array([0.6, 0.4, 0.2])
 
 
 def build(lights: str, geoms: str = "", *, shadows: bool = False, specular: float = 0.0, shininess: float = 0.5):
-    """A floor at z = 0 seen from 2 m above, with no headlight; returns (jitted render, scene)."""
+    """Builds a floor at z = 0 seen from 2 m above, with no headlight; returns (jitted render, scene)."""
     model = mujoco.MjModel.from_xml_string(f"""<mujoco><statistic extent="2"/><visual><headlight active="0"/></visual>
         <asset><material name="m" specular="{specular}" shininess="{shininess}"/></asset><worldbody>
         <camera name="eye" pos="0 0 2" fovy="60"/>{lights}
@@ -28,7 +28,7 @@ def build(lights: str, geoms: str = "", *, shadows: bool = False, specular: floa
 
 
 def floor_points() -> np.ndarray:
-    """[H, W, 3] m, where the pixels' rays meet the floor."""
+    """Returns [H, W, 3] (m), where the pixels' rays meet the floor."""
     half = 2 * np.tan(np.deg2rad(30))
     steps = half * ((np.arange(SIZE) + 0.5) * 2 / SIZE - 1)
     x, y = np.meshgrid(steps, -steps)
@@ -111,7 +111,7 @@ def test_shadows_leave_a_lit_convex_geom_alone():
 
 @pytest.fixture(scope="module")
 def lively():
-    """Mean color of a scene with solids, shadows, background and two kinds of light, as a function of the scene."""
+    """Makes a function: mean color of a scene with solids, shadows, background and two kinds of light."""
     render, scene = build(
         '<light type="directional" dir="-.3 .2 -1" diffuse=".5 .5 .5"/>'
         '<light type="spot" pos=".4 .4 1.5" dir="-.2 -.2 -1" ambient=".1 .1 .1" castshadow="false"/>',

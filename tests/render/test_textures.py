@@ -44,7 +44,7 @@ def test_regular_families_repeat(name):
 
 @pytest.mark.parametrize("name", NAMES[1:])
 def test_both_colors_show_on_a_thing(name):
-    """Over a ball as large as a small object, in the largest period."""
+    """Covers a ball as large as a small object, in the largest period."""
     rng = np.random.default_rng(0)
     place = rng.normal(size=(3, 4000))
     place *= 0.04 / textures.PERIOD[1] / np.linalg.norm(place, axis=0) * rng.uniform(size=4000) ** (1 / 3)
@@ -55,7 +55,7 @@ def test_both_colors_show_on_a_thing(name):
 
 
 def textured(seed):
-    """A renderer, and a scene in which every geom has another texture that is fixed to its body."""
+    """Makes a renderer, and a scene in which every geom has another texture that is fixed to its body."""
     model = mujoco.MjModel.from_xml_string(random_scene(seed))
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)

@@ -41,7 +41,7 @@ def test_a_method_has_no_settings_of_another(tmp_path):
 
 
 def test_a_package_of_ones_own_is_found(tmp_path, monkeypatch):
-    """An installed distribution that names its module as a plugin: its environment and its method have flags."""
+    """Installs a distribution that names its module as a plugin: its environment and its method have flags."""
     (tmp_path / "mine.py").write_text(
         "import milx\n"
         "from milx.envs.reach.env import ReachState\n"

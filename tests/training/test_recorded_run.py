@@ -30,7 +30,7 @@ MEAN, SPREAD = np.array([3.0, -1.0]), np.array([2.0, 0.1])
 
 
 def random_demo(rng, direction, length):
-    """Images of a task's color; actions along its direction, and on the state."""
+    """Draws images of a task's color, and actions along its direction and on the state."""
     state = rng.normal(size=(length, 3)).astype(np.float32)
     color = np.uint8(128 + 100 * np.append(direction, 0.0))
     image = np.broadcast_to(color, (length, 12, 16, 3))
@@ -40,7 +40,7 @@ def random_demo(rng, direction, length):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """40 tasks, each a direction, with 3 demonstrations of 7 to 12 steps."""
+    """Writes 40 tasks, each a direction, with 3 demonstrations of 7 to 12 steps."""
     folder, rng = tmp_path_factory.mktemp("recording") / "set", np.random.default_rng(0)
     with Writer(folder, (12, 16), 3, 2, "a test") as writer:
         for task in range(40):
@@ -69,7 +69,7 @@ def trained(cache, folder, tmp_path_factory):
 
 
 def test_held_out_tasks_are_learned_from_their_demonstration(trained):
-    """The direction is the task; its share of the actions' variance is 1.5^2/2 of 1.5^2/2 + 0.5^2."""
+    """Compares with the direction's share of the actions' variance, 1.5^2/2 of 1.5^2/2 + 0.5^2: it is the task."""
     run, result = trained
     errors = result["action_error"]
     assert errors["tasks"] == 6
@@ -90,7 +90,7 @@ def read_resampled(data, task):
 
 
 def test_errors_are_those_of_a_loop_over_demonstrations(trained, folder):
-    """What the run reports, worked out with the policy that users load, step by step."""
+    """Compares what the run reports with what the policy that users load does, step by step."""
     run, result = trained
     policy, data = milx.load(run.folder), DataSet(folder)
     training = recorded.read_vectors(data, data.header.of_split("train"), HORIZON).action
@@ -117,7 +117,7 @@ def test_whitening_is_fitted_to_the_training_tasks_alone(trained, folder):
 
 
 def test_an_interrupted_run_ends_bit_for_bit_like_the_uninterrupted_one(trained, folder, tmp_path, monkeypatch, capsys):
-    """Also when the data passes by in shards, of which none is whole."""
+    """Interrupts a run, also one whose data passes by in shards, of which none is whole."""
     config = tiny_config(folder)
     config.train.steps, config.train.eval_every = 200, 100
     size = 3 * HORIZON * (12 * 16 * 3 + 4 * 5) * 1.01
@@ -186,7 +186,7 @@ def test_bad_data_is_refused_before_anything_is_compiled(folder, tmp_path):
 
 
 def run_with_losses(folder, workdir, monkeypatch, spoil):
-    """A run in which the loss of every task is multiplied by `spoil(number of the task)`; returns what it said, too."""
+    """Multiplies the loss of every task by `spoil(number of the task)`, and returns the run and its output."""
     config = tiny_config(folder)
     config.train.steps = config.train.eval_every = 60
     config.train.log_every, config.train.meta_batch = 20, 2
@@ -203,7 +203,7 @@ def run_with_losses(folder, workdir, monkeypatch, spoil):
 
 
 def test_updates_that_are_not_finite_are_skipped_counted_and_named(folder, tmp_path, monkeypatch):
-    """One training task of thirty is to blame: about one batch of two in fifteen, and no parameter sees it."""
+    """Spoils one training task of thirty, about one batch of two in fifteen; no parameter sees it."""
     run, console = run_with_losses(folder, tmp_path, monkeypatch, lambda n: jnp.where(n == 17, jnp.nan, 1.0))
     run.train()
     lines = [json.loads(line) for line in (tmp_path / "metrics.jsonl").open()]
@@ -227,7 +227,7 @@ def test_a_run_without_a_finite_update_stops(folder, tmp_path, monkeypatch):
 
 
 def test_where_there_are_no_states_none_are_needed(tmp_path):
-    """From the data set to the exported policy, which is that of `milx.load`."""
+    """Goes from the data set to the exported policy, and compares that with `milx.load`."""
     rng = np.random.default_rng(0)
     with Writer(tmp_path / "set", (12, 16), 0, 2, "a test") as writer:
         for task, split in enumerate(("train", "train", "validation", "test")):
@@ -249,7 +249,7 @@ def test_where_there_are_no_states_none_are_needed(tmp_path):
 
 
 def test_what_may_be_shown_without_actions_is_not_what_is_asked_for(tmp_path):
-    """One of three demonstrations shows actions: it is the query, whether it comes first or last."""
+    """Gives one of three demonstrations actions: it is the query, whether it comes first or last."""
     rng = np.random.default_rng(0)
     for place in range(3):
         folder = tmp_path / f"set {place}"

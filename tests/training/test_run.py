@@ -48,7 +48,7 @@ class StoppedError(Exception):
 
 
 def same_run(trained, folder):
-    """A new run of the same configuration; it borrows the compiled programs."""
+    """Makes a new run of the same configuration; it borrows the compiled programs."""
     run = SimulatedRun(tiny_config(), folder, QUIET)
     run.env, run.method, run.trainer = trained.run.env, trained.run.method, trained.run.trainer
     return run

@@ -61,7 +61,7 @@ def test_the_signal_is_noted_where_it_is_deferred_and_what_was_there_before_come
 
 
 def test_elsewhere_the_signal_ends_the_process_at_once_and_well():
-    """Even while the main thread waits for a program of XLA, and another one would go on for a minute."""
+    """Signals while the main thread waits for a program of XLA, and another thread would go on for a minute."""
     program = """
     import threading, time
     import jax, jax.numpy as jnp

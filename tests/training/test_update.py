@@ -14,7 +14,7 @@ STEPS = 40
 
 
 def rates(config, gradient=1.0):
-    """Adam moves a parameter with a constant gradient by its learning rate, whatever the gradient is."""
+    """Measures learning rates: Adam moves a parameter with a constant gradient by them, whatever the gradient is."""
     optimizer = make_optimizer(config, STEPS)
     state, moved = optimizer.init(jnp.zeros(())), []
     for _ in range(STEPS):

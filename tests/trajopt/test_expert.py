@@ -52,7 +52,7 @@ def test_without_noise_the_expert_reaches_every_target_within_reach(demonstratio
 
 
 def test_what_is_planned_is_what_its_version_says(env, demonstrations):
-    """Tasks, scenes, physics, costs, iLQR and noise: the first scene's two demonstrations, at every tenth step."""
+    """Compares tasks, scenes, physics, costs, iLQR and noise: the first scene's demonstrations, at every tenth step."""
     _, _, states, actions, _ = demonstrations
     seen = states.mocap_pos[0, 0, 0], states.qpos[0, :, ::10], actions[0, :, ::10]
     planned.check("reach", [env.version, expert.VERSION], np.concatenate([np.ravel(x) for x in seen]), atol=2e-3)
@@ -76,7 +76,7 @@ def test_recorded_actions_are_the_feedback_on_the_recorded_states(demonstrations
 
 
 def test_the_arm_is_driven_by_the_recorded_action_plus_noise(env, demonstrations):
-    """C MuJoCo, from the recorded states: the actions that explain the next velocities spread as the noise does."""
+    """Infers the actions from C MuJoCo's next velocities: they spread as the noise does."""
     _, _, states, actions, _ = demonstrations
     data = mujoco.MjData(env.mj_model)
 

@@ -23,7 +23,7 @@ def float64():
 
 
 def random_lq(seed, T=15, n=4, m=2):
-    """A random linear system, stable so that limits leave it controllable, that has to follow a random reference."""
+    """Samples a linear system, stable so that limits leave it controllable, that has to follow a random reference."""
     rng = np.random.default_rng(seed)
     A = np.eye(n) + 0.3 * rng.standard_normal((n, n))
     return {
@@ -49,7 +49,7 @@ def lq_problem(lq, limit):
 
 
 def riccati(lq):
-    """The discrete Riccati recursion of the tracking problem: states, actions and gains."""
+    """Solves the discrete Riccati recursion of the tracking problem: states, actions and gains."""
     A, B, R, Q = lq["A"], lq["B"], lq["R"].T @ lq["R"], lq["S"].T @ lq["S"]
     P, p = lq["S_T"].T @ lq["S_T"], np.zeros(len(A))
     K, k = [], []
@@ -66,7 +66,7 @@ def riccati(lq):
 
 
 def bounded_least_squares(lq, limit):
-    """The optimal actions under limits, from SciPy: the residuals of the whole problem are M u + c in the actions."""
+    """Computes the optimal actions under limits by SciPy: the problem's residuals are M u + c in the actions."""
     T, m = lq["guess"].shape
 
     def residuals(actions):
@@ -179,7 +179,7 @@ T, H, LIMIT = 60, 0.05, 4.0
 
 
 def pendulum(x, u):
-    """Semi-implicit Euler; the angle is zero upright, gravity 9.81, mass and length 1."""
+    """Steps by semi-implicit Euler; the angle is zero upright, gravity 9.81, mass and length 1."""
     angle, velocity = x
     velocity = velocity + H * (9.81 * jnp.sin(angle) - 0.05 * velocity + u[0])
     return jnp.stack([angle + H * velocity, velocity])
@@ -204,7 +204,7 @@ STARTS = np.array([[np.pi, 0.0], [2.0, 1.0], [-3.0, 0.5], [0.3, 0.0]])
 
 
 def rollout_cost(actions, start, gains=None, states=None):
-    """J by an independent rollout in NumPy, open-loop or with feedback."""
+    """Computes J by an independent rollout in NumPy, open-loop or with feedback."""
     x, cost = np.array(start), 0.0
     residual = lambda x: np.array([np.sin(x[0]), 1 - np.cos(x[0]), 0.3 * x[1]])  # noqa: E731
     for t, u in enumerate(np.asarray(actions)):
@@ -251,7 +251,7 @@ def test_plans_are_rollouts_within_limits(swing_ups):
 
 
 def test_plans_are_stationary(swing_ups):
-    """Central differences of the whole cost: zero inside the limits, pushing outwards on them."""
+    """Compares with central differences of the whole cost: zero inside the limits, pushing outwards on them."""
     epsilon = 1e-5
     for start, plan in zip(STARTS, swing_ups, strict=True):
         assert plan.converged
