@@ -151,14 +151,14 @@ class Cells:
         clock = [time.perf_counter()]
         env, method, evaluation = self._env(config), self._trainer(config).method, config.evaluation
         train, test = self._first_tasks(config), self._demos(config, "test")
-        floors = self._once(
-            ("floors", env),
-            lambda: closed_loop.baselines(env, test, evaluation, config.data, trial_key("test")),
+        baselines = self._once(
+            ("baselines", env),
+            lambda: closed_loop.evaluate_baselines(env, test, evaluation, config.data, trial_key("test")),
         )
         clock.append(time.perf_counter())
         trained = self.train(name, config)
         clock.append(time.perf_counter())
-        _, found = result_of(env, method, trained.params, test, config, floors)
+        _, found = result_of(env, method, trained.params, test, config, baselines)
         clock.append(time.perf_counter())
         demos_s, _, evaluate_s = (later - earlier for earlier, later in itertools.pairwise(clock))
         seconds = {"demos": demos_s, **trained.seconds, "evaluate": trained.seconds["evaluate"] + evaluate_s}

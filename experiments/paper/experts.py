@@ -19,7 +19,7 @@ from milx import envs
 from milx.config.schema import DataConfig, EvalConfig
 from milx.data.simulated import collect
 from milx.evaluation import provenance, results
-from milx.evaluation.closed_loop import baselines
+from milx.evaluation.closed_loop import evaluate_baselines
 from milx.evaluation.intervals import wilson_interval
 
 EXPERTS = {"controller": 0, "one-tactic": 0, "ilqr": 5}
@@ -32,7 +32,7 @@ _SCENES = flags.DEFINE_integer("scenes", 512, "Scenes of each split, each of ano
 
 
 def compare(name: str, scenes: int) -> list[dict[str, Any]]:
-    """Success of an expert for each split and noise, with floors beside the controller's.
+    """Success of an expert for each split and noise, with baselines beside the controller's.
 
     The seconds of the first entry include compilation.
     """
@@ -54,9 +54,9 @@ def compare(name: str, scenes: int) -> list[dict[str, Any]]:
             found.append(row | {"seconds": time.perf_counter() - began})
             print(name, found[-1], flush=True)
         if name == "controller":
-            floors = baselines(env, demos, EvalConfig(trials=1, baseline_trials=1, batch=128), config, key)
-            found[-1]["baselines"] = floors.success
-            print(name, split, floors.success, flush=True)
+            baselines = evaluate_baselines(env, demos, EvalConfig(trials=1, baseline_trials=1, batch=128), config, key)
+            found[-1]["baselines"] = baselines.success
+            print(name, split, baselines.success, flush=True)
     return found
 
 

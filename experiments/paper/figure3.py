@@ -110,9 +110,9 @@ def draw(results: list[dict[str, Any]], path: pathlib.Path) -> None:
             mean, low, high = ([100 * point[i] for point in curve.values()] for i in range(3))
             (line,) = axis.plot(list(curve), mean, marker="o", label=labels[env, method])
             axis.fill_between(list(curve), low, high, color=line.get_color(), alpha=0.2)
-        floors = next(result["baselines"] for result in results if result["env"] == env)
+        baselines = next(result["baselines"] for result in results if result["env"] == env)
         for name, style in (("random", ":"), ("task_blind", "--"), ("expert", "-.")):
-            axis.axhline(100 * floors[name], color="gray", linestyle=style, label=name.replace("_", "-"))
+            axis.axhline(100 * baselines[name], color="gray", linestyle=style, label=name.replace("_", "-"))
         axis.set(xscale="log", title=TITLES[env], xlabel="demonstrations for meta-training", ylim=(0, 100))
         sizes = sorted({size for key, curve in curves.items() if key[0] == env for size in curve})
         axis.set_xticks(sizes, [f"{size:,}" for size in sizes], fontsize=7, rotation=30)

@@ -39,11 +39,11 @@ def headline() -> str:
     }
     lines = ["| | success (95%; seeds) | random | task-blind | expert | paper |", "|---|---|---|---|---|---|"]
     for label, (runs, paper) in rows.items():
-        floors = [
+        baselines = [
             f"{statistics.mean(run['baselines'][name] for run in runs):.1%}"
             for name in ("random", "task_blind", "expert")
         ]
-        lines.append(f"| {label} | {tables.interval(runs)} | {' | '.join(floors)} | {paper} |")
+        lines.append(f"| {label} | {tables.interval(runs)} | {' | '.join(baselines)} | {paper} |")
     return "\n".join(lines)
 
 

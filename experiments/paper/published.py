@@ -57,14 +57,14 @@ def markdown(rows: dict[str, Row], found: dict[str, dict[str, Any]]) -> str:
         if not all(columns):
             continue
         shown = " / ".join(interval(runs) for runs in columns)
-        floors = [
-            f"{statistics.mean(run['baselines'][floor] for run in columns[0]):.1%}"
-            if floor in columns[0][0]["baselines"]
+        baselines = [
+            f"{statistics.mean(run['baselines'][baseline] for run in columns[0]):.1%}"
+            if baseline in columns[0][0]["baselines"]
             else ""  # not measured yet when it ran
-            for floor in ("other_demo", "random", "task_blind", "expert")
+            for baseline in ("other_demo", "random", "task_blind", "expert")
         ]
         seconds = f"{statistics.mean(run['wall_clock_s']['train'] for run in columns[0]):.0f} s"
-        lines.append(f"| {row.label} | {shown} | {' | '.join(floors)} | {seconds} | {row.published} |")
+        lines.append(f"| {row.label} | {shown} | {' | '.join(baselines)} | {seconds} | {row.published} |")
     return "\n".join(lines)
 
 

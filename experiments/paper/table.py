@@ -27,14 +27,14 @@ def setting(result: dict) -> str:
 def row(result: dict) -> str:
     """Writes one result file as a line of the table."""
     low, high = result["wilson95"]
-    floors = result["baselines"]
+    baselines = result["baselines"]
     cells = [
         method(result),
         setting(result),
         str(result["seed"]),
         f"{result['success']:.1%} ({low:.1%} to {high:.1%})",
         str(result["trials"]),
-        *(f"{floors[name]:.1%}" for name in ("random", "task_blind", "expert")),
+        *(f"{baselines[name]:.1%}" for name in ("random", "task_blind", "expert")),
         f"{result['wall_clock_s']['total']:.0f} s",
         result["hardware"],
     ]
@@ -44,14 +44,14 @@ def row(result: dict) -> str:
 def mean(group: list[dict]) -> str:
     """Writes the mean over the runs of one setting as a line of the table."""
     successes = [result["success"] for result in group]
-    floors = [statistics.mean(r["baselines"][name] for r in group) for name in ("random", "task_blind", "expert")]
+    baselines = [statistics.mean(r["baselines"][name] for r in group) for name in ("random", "task_blind", "expert")]
     cells = [
         method(group[0]),
         setting(group[0]),
         f"mean of {len(group)}, range",
         f"**{statistics.mean(successes):.1%}** ({min(successes):.1%} to {max(successes):.1%})",
         str(sum(result["trials"] for result in group)),
-        *(f"{floor:.1%}" for floor in floors),
+        *(f"{baseline:.1%}" for baseline in baselines),
         f"{statistics.mean(result['wall_clock_s']['total'] for result in group):.0f} s",
         "",
     ]

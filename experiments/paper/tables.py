@@ -107,9 +107,9 @@ def markdown(table: Table, rows: list[str], found: dict[str, dict[str, Any]]) ->
         for name, columns in runs.items():
             shown = [interval([judged(run, criterion) for run in seeds]) for seeds in columns]
             lines.append(f"| {table.rows[name].label} | {' | '.join(shown)} | {table.rows[name].paper} |")
-        floors = [[judged(run, criterion)["baselines"] for run in seeds] for seeds in longest]
+        baselines = [[judged(run, criterion)["baselines"] for run in seeds] for seeds in longest]
         for name in ("random", "task_blind", "expert"):
-            shown = [f"{statistics.mean(run[name] for run in seeds):.1%}" for seeds in floors]
+            shown = [f"{statistics.mean(run[name] for run in seeds):.1%}" for seeds in baselines]
             lines.append(f"| *{name.replace('_', '-')}* | {' | '.join(shown)} | |")
         lines.append("")
     return "\n".join([*lines, f"{first['trials']} trials for each seed; in brackets their intervals and their number."])

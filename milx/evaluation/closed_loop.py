@@ -1,4 +1,4 @@
-"""Closed-loop evaluation on held-out tasks, with floors and a ceiling beside the result.
+"""Closed-loop evaluation on held-out tasks, with baselines and an upper bound beside the result.
 
 One adaptation per task, on a demonstration whose own scene is never a trial scene; then trials in fresh scenes.
 """
@@ -153,7 +153,7 @@ def listen(env: Env, method: Method, params: Params, demos: DemoSet, shots: int)
     return {name: float(value) for name, value in _listen(env, method, params, chosen, shots).items()}
 
 
-class Floors(NamedTuple):
+class Baselines(NamedTuple):
     """Success rates of "random" actions, the "task_blind" expert, and the "expert".
 
     `summarize` adds the policy's own with another task's demonstration, "other_demo".
@@ -167,7 +167,7 @@ class Floors(NamedTuple):
     other: dict[str, dict[str, float]]
 
 
-def baselines(env: Env, demos: DemoSet, config: EvalConfig, expert: DataConfig, key: jax.Array) -> Floors:
+def evaluate_baselines(env: Env, demos: DemoSet, config: EvalConfig, expert: DataConfig, key: jax.Array) -> Baselines:
     """Evaluates random actions, the task-blind expert and the expert in the same trials.
 
     They run in the first `config.baseline_trials` of every task's trials. The task-blind expert goes to a random
@@ -198,7 +198,7 @@ def baselines(env: Env, demos: DemoSet, config: EvalConfig, expert: DataConfig, 
             "expert": float(halves[1]),
         }
 
-    return Floors(rates(success, random.success), {name: rates(other[name], random.other[name]) for name in other})
+    return Baselines(rates(success, random.success), {name: rates(other[name], random.other[name]) for name in other})
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -210,7 +210,9 @@ def film(camera: Env, task: Task, states: State) -> jax.Array:
     return jax.vmap(camera.film)(task, states)
 
 
-def summarize(env: Env, config: Config, task: Task, trials: Trials, misled: Trials, floors: Floors) -> dict[str, Any]:
+def summarize(
+    env: Env, config: Config, task: Task, trials: Trials, misled: Trials, baselines: Baselines
+) -> dict[str, Any]:
     """Summarizes an evaluation for a result file: what was asked and what came out, by every criterion.
 
     Args:
@@ -219,28 +221,28 @@ def summarize(env: Env, config: Config, task: Task, trials: Trials, misled: Tria
         task: [N] what was tried.
         trials: after adaptation to each task's own demonstrations.
         misled: after adaptation to another task's, judged by the own task.
-        floors: what stands beside the results.
+        baselines: what stands beside the results.
     """
     kind = np.asarray(jax.vmap(env.target_kind)(task))
     kind = np.where(kind < 0, np.arange(len(kind)), kind)
 
-    def judged(success: jax.Array, floors: dict[str, float], misled: jax.Array) -> dict[str, Any]:
+    def judged(success: jax.Array, baselines: dict[str, float], misled: jax.Array) -> dict[str, Any]:
         successes, trials = int(success.sum()), int(success.size)
         return {
             "success": successes / trials,
             "wilson95": list(wilson_interval(successes, trials)),
             "bootstrap95": list(bootstrap_interval(np.asarray(success), kind)),
-            "baselines": {**floors, "other_demo": float(misled.mean())},
+            "baselines": {**baselines, "other_demo": float(misled.mean())},
         }
 
-    other = {name: judged(success, floors.other[name], misled.other[name]) for name, success in trials.other.items()}
+    other = {name: judged(success, baselines.other[name], misled.other[name]) for name, success in trials.other.items()}
     return {
         "num_tasks_train": config.data.tasks,
         "num_demos_train": config.data.tasks * config.data.demos_per_task,
         "shots": config.evaluation.shots,
         "given": config.method.given if env.vision else config.method.given.removeprefix("video+"),
         "trials": int(trials.success.size),
-        **judged(trials.success, floors.success, misled.success),
+        **judged(trials.success, baselines.success, misled.success),
         "criterion": env.criterion,
         **({"other_criteria": other} if other else {}),
     }

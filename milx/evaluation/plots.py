@@ -12,7 +12,7 @@ from milx.evaluation import listening
 
 
 def learning_curve(metrics: list[dict[str, Any]], evaluation: dict[str, Any], path: pathlib.Path) -> None:
-    """Plots whether the policy listens, how far the inner step moves it, and its success with floors and ceiling.
+    """Plots whether the policy listens, how far the inner step moves it, and its success beside the baselines.
 
     Args:
         metrics: lines with "step" and what `listening.measure` found, perhaps "goal_loss", or "validation_success".

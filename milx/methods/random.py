@@ -1,4 +1,4 @@
-"""A policy that sees nothing: the floor below all others."""
+"""A policy that sees nothing: the baseline of all others."""
 
 import dataclasses
 

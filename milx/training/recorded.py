@@ -182,10 +182,10 @@ class RecordedRun(Run):
         """Prints the errors of the actions."""
         errors = result["action_error"]
         names = {"before": "before adaptation", "other_task": "adapted to another task", "mean_action": "mean action"}
-        floors = ", ".join(f"{label} {errors[name]:.3f}" for name, label in names.items() if name in errors)
+        baselines = ", ".join(f"{label} {errors[name]:.3f}" for name, label in names.items() if name in errors)
         self.console.print(
             f"[bold]{errors['after']:.3f}[/bold] +- {errors['standard_error']:.3f} is the squared error of the actions "
-            f"on {errors['tasks']} held-out tasks after adaptation ({floors}). See {self.folder}"
+            f"on {errors['tasks']} held-out tasks after adaptation ({baselines}). See {self.folder}"
         )
 
     def _errors(self, params: Params, split: str) -> dict[str, float]:

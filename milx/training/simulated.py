@@ -76,12 +76,12 @@ def validation_of(
 
 
 def result_of(
-    env: envs.Env, method: Method, params: Params, demos: DemoSet, config: Config, floors: closed_loop.Floors
+    env: envs.Env, method: Method, params: Params, demos: DemoSet, config: Config, baselines: closed_loop.Baselines
 ) -> tuple[Trials, dict[str, Any]]:
     """Evaluates on the test tasks: the trials, and what the result file says of them."""
     trials = closed_loop.run_trials(env, method, params, demos, config.evaluation, trial_key("test"))
     misled = closed_loop.run_trials(env, method, params, demos, config.evaluation, trial_key("test"), misled=True)
-    return trials, closed_loop.summarize(env, config, demos.task, trials, misled, floors)
+    return trials, closed_loop.summarize(env, config, demos.task, trials, misled, baselines)
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -123,12 +123,12 @@ class SimulatedRun(Run):
         return demos
 
     def report(self, result: dict[str, Any]) -> None:
-        """Prints success, interval, floors and ceiling."""
+        """Prints success, interval, baselines and upper bound."""
         low, high = result["wilson95"]
-        floors = ", ".join(f"{name.replace('_', '-')} {value:.1%}" for name, value in result["baselines"].items())
+        baselines = ", ".join(f"{name.replace('_', '-')} {value:.1%}" for name, value in result["baselines"].items())
         self.console.print(
             f"[bold]{result['success']:.1%}[/bold] of {result['trials']} trials on held-out tasks succeed "
-            f"(95% interval {low:.1%} to {high:.1%}; {floors}). {result['wall_clock_s']['total']:.0f} s in all. "
+            f"(95% interval {low:.1%} to {high:.1%}; {baselines}). {result['wall_clock_s']['total']:.0f} s in all. "
             f"See {self.folder}"
         )
 
@@ -156,8 +156,9 @@ class SimulatedRun(Run):
     def _judge(self, params: Params) -> tuple[dict[str, Any], Callable[[dict[str, Any]], None]]:
         config, test = self.config, self.demos("test")
         with self.clock("evaluate"):
-            floors = closed_loop.baselines(self.env, test, config.evaluation, config.data, trial_key("test"))
-            trials, found = result_of(self.env, self.method, params, test, config, floors)
+            key = trial_key("test")
+            baselines = closed_loop.evaluate_baselines(self.env, test, config.evaluation, config.data, key)
+            trials, found = result_of(self.env, self.method, params, test, config, baselines)
 
         def draw(result: dict[str, Any]) -> None:
             metrics = read_metrics(self.folder / "metrics.jsonl")

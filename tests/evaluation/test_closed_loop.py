@@ -39,13 +39,13 @@ def test_wilson_interval_against_scipy(trials):
         assert 0 <= low <= successes / trials <= high <= 1
 
 
-def test_a_result_counts_trials_by_every_criterion_and_has_floors_beside_each():
+def test_a_result_counts_trials_by_every_criterion_and_has_baselines_beside_each():
     table = jnp.array([[True, False, True], [False, False, True]])
-    floors = closed_loop.Floors({"random": 0.1}, {"nearly": {"random": 0.2}})
+    baselines = closed_loop.Baselines({"random": 0.1}, {"nearly": {"random": 0.2}})
     env = types.SimpleNamespace(vision=True, criterion="exactly", target_kind=lambda task: task)
     trials = closed_loop.Trials(table, {"nearly": ~table | table}, ())
     misled = closed_loop.Trials(~table, {"nearly": table}, ())
-    found = closed_loop.summarize(env, tiny_config(), jnp.array([-1, -1]), trials, misled, floors)
+    found = closed_loop.summarize(env, tiny_config(), jnp.array([-1, -1]), trials, misled, baselines)
     assert (found["trials"], found["success"]) == (6, 0.5)
     assert found["baselines"] == {"random": 0.1, "other_demo": 0.5}
     assert found["wilson95"] == list(intervals.wilson_interval(3, 6))
@@ -146,7 +146,7 @@ def test_baselines_run_in_the_first_trials(trained, monkeypatch, trials, asked, 
 
     monkeypatch.setattr(closed_loop, "perform", watch)
     plans = dataclasses.replace(trained.config.data, plan_batch=2 * 3 * tried)
-    rates = closed_loop.baselines(env, trained.test, config, plans, key).success
+    rates = closed_loop.evaluate_baselines(env, trained.test, config, plans, key).success
     scene = closed_loop.trial_scenes(env, trained.test.task, jax.random.split(key)[0], trials)
     expected = jax.tree.map(lambda x: x[:, :tried].reshape(-1, *x.shape[2:]), scene)
     twice = jax.tree.map(lambda x: jnp.concatenate([x, x]), expected)
