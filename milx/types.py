@@ -13,8 +13,11 @@ import jax
 Array = Any
 """A `jax.Array`. Public functions also accept NumPy arrays. Inside `jax.eval_shape` it is a `jax.ShapeDtypeStruct`."""
 
-Params = Any
-"""A pytree of arrays: the parameters that a method learns, or those that it has adapted to one task."""
+Params = dict[str, Any]
+"""A pytree of arrays, a dictionary at its root: the parameters that a method learns."""
+
+TaskParams = Any
+"""A pytree of arrays: what a policy has learned of one task, and acts by."""
 
 Memory = Any
 """A pytree of arrays that a policy passes from one time step to the next; `()` for a policy without memory."""

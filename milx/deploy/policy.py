@@ -15,7 +15,7 @@ from milx.config.schema import GIVEN, Config
 from milx.core.checkpoint import Checkpoints
 from milx.data.goals import goals
 from milx.methods import Method
-from milx.types import SPEC_FILE, Demo, Memory, Observation, Params, Spec
+from milx.types import SPEC_FILE, Demo, Memory, Observation, Params, Spec, TaskParams
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -38,7 +38,7 @@ class Policy:
     params: Params
     config: Config
 
-    def adapt(self, params: Params, demo: Demo) -> Params:
+    def adapt(self, params: Params, demo: Demo) -> TaskParams:
         """Adapts to a task from one demonstration [T, ...] or several [K, T, ...]; the computation is jitted.
 
         Args:
@@ -55,7 +55,7 @@ class Policy:
         """
         return self._adapt(params, check_demo(demo, self.spec, self.config.method.given))
 
-    def act(self, task_params: Params, observation: Observation) -> jax.Array:
+    def act(self, task_params: TaskParams, observation: Observation) -> jax.Array:
         """Returns the action [A], in the environment's units, for one observation; the computation is jitted.
 
         Raises:
@@ -66,7 +66,7 @@ class Policy:
             raise ValueError("memory: missing, expected `Policy.step`: this policy remembers what it saw first")
         return self.step(task_params, observation, self.initial_memory)[0]
 
-    def step(self, task_params: Params, observation: Observation, memory: Memory) -> tuple[jax.Array, Memory]:
+    def step(self, task_params: TaskParams, observation: Observation, memory: Memory) -> tuple[jax.Array, Memory]:
         """Returns the action, as `act` does, and the memory for the next time step; the computation is jitted.
 
         Args:

@@ -8,7 +8,7 @@ import abc
 import dataclasses
 import functools
 import pathlib
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +22,9 @@ from milx.render.textures import Textures
 from milx.types import SPLITS, Observation, Spec
 
 Task = Any
+"""A pytree of arrays: what an environment means by a task."""
+
+TaskT = TypeVar("TaskT")
 ASSETS = pathlib.Path(__file__).parent / "assets"
 
 
@@ -51,8 +54,8 @@ class State:
         return dataclasses.replace(self, qpos=x[..., :nq], qvel=x[..., nq:])
 
 
-class Env(abc.ABC):
-    """A simulated environment on MJX.
+class Env(abc.ABC, Generic[TaskT]):
+    """A simulated environment on MJX, for tasks of type `TaskT`, a pytree of arrays.
 
     Subclasses set the class attributes and write the abstract methods. All methods are pure and take one world;
     `jax.vmap` gives batches.
@@ -156,22 +159,22 @@ class Env(abc.ABC):
         """S, the size of `observe(...).state`."""
 
     @abc.abstractmethod
-    def sample_task(self, key: jax.Array, split: str) -> Task:
+    def sample_task(self, key: jax.Array, split: str) -> TaskT:
         """Draws a task of a split ("train", "validation" or "test"); raises ValueError for another split."""
 
     @abc.abstractmethod
-    def redraw_appearance(self, key: jax.Array, task: Task) -> Task:
+    def redraw_appearance(self, key: jax.Array, task: TaskT) -> TaskT:
         """Changes the task's appearance to another of the training split; its demonstrations are valid for both."""
 
     @abc.abstractmethod
-    def redraw_scene(self, key: jax.Array, task: Task, states: State) -> State:
+    def redraw_scene(self, key: jax.Array, task: TaskT, states: State) -> State:
         """Moves what did not take part in an episode to where `reset` might have put it.
 
         `states` has a leading axis T + 1. Where everything takes part, this is `states`.
         """
 
     @abc.abstractmethod
-    def reset(self, key: jax.Array, task: Task) -> State:
+    def reset(self, key: jax.Array, task: TaskT) -> State:
         """Draws a scene of the task: the state at the start of an episode."""
 
     @abc.abstractmethod
@@ -179,38 +182,38 @@ class Env(abc.ABC):
         """Returns [S], what the robot knows of itself and, where there is no image, of the objects (units below)."""
 
     @abc.abstractmethod
-    def colors(self, task: Task) -> jax.Array:
+    def colors(self, task: TaskT) -> jax.Array:
         """Returns [G, 4] RGBA in [0, 1] of every geom in this task."""
 
-    def textures(self, task: Task, data: mjx.Data) -> Textures | None:
+    def textures(self, task: TaskT, data: mjx.Data) -> Textures | None:
         """Returns the textures [G] of all geoms, with frames that take the world's; none unless overridden."""
         return None
 
     @abc.abstractmethod
-    def running_residual(self, task: Task, state: State, action: jax.Array, t: jax.Array) -> jax.Array:
+    def running_residual(self, task: TaskT, state: State, action: jax.Array, t: jax.Array) -> jax.Array:
         """Computes the residual [R] of the running cost at step t; the expert minimizes half its square."""
 
     @abc.abstractmethod
-    def terminal_residual(self, task: Task, state: State) -> jax.Array:
+    def terminal_residual(self, task: TaskT, state: State) -> jax.Array:
         """Computes the residual [R'] of the terminal cost."""
 
     @abc.abstractmethod
-    def success(self, task: Task, states: State) -> jax.Array:
+    def success(self, task: TaskT, states: State) -> jax.Array:
         """Tells whether an episode succeeded. `states` has a leading axis T + 1; returns a bool scalar."""
 
-    def other_criteria(self, task: Task, states: State) -> dict[str, jax.Array]:
+    def other_criteria(self, task: TaskT, states: State) -> dict[str, jax.Array]:
         """Success by other measures, by what they ask for; reported beside, none unless overridden."""
         return {}
 
     @abc.abstractmethod
-    def task_blind(self, key: jax.Array, task: Task) -> Task:
+    def task_blind(self, key: jax.Array, task: TaskT) -> TaskT:
         """Makes a random candidate the target, as someone would who saw no demonstration."""
 
-    def target_kind(self, task: Task) -> jax.Array:
+    def target_kind(self, task: TaskT) -> jax.Array:
         """Returns a number for the kind of the task's target; -1, the default, where every task has its own."""
         return jnp.asarray(-1)
 
-    def control(self, task: Task, state: State, tactic: jax.Array) -> jax.Array:
+    def control(self, task: TaskT, state: State, tactic: jax.Array) -> jax.Array:
         """Returns the action [A] of a controller that knows the task, by one of the `tactics`. It may replace iLQR.
 
         Raises:
@@ -218,11 +221,11 @@ class Env(abc.ABC):
         """
         raise ValueError(f"data.plan_iterations: got 0, expected at least 1: {self.name} has no controller")
 
-    def guess(self, task: Task, state: State) -> jax.Array:
+    def guess(self, task: TaskT, state: State) -> jax.Array:
         """Returns actions [T, A] with which the planner begins; zero unless overridden."""
         return jnp.zeros((self.horizon, self.action_size))
 
-    def model_of(self, task: Task) -> mjx.Model:
+    def model_of(self, task: TaskT) -> mjx.Model:
         """Returns the model with the task's shapes, masses and friction; the same for all tasks unless overridden."""
         del task
         return self.model
@@ -232,7 +235,7 @@ class Env(abc.ABC):
         return self._data.replace(qpos=state.qpos, qvel=state.qvel, mocap_pos=state.mocap_pos)
 
     @functools.partial(jax.jit, static_argnums=0)  # so that MJX, slow to trace, is traced once for all callers
-    def step(self, task: Task, state: State, action: jax.Array) -> State:
+    def step(self, task: TaskT, state: State, action: jax.Array) -> State:
         """Applies `action` [A], clipped to `action_range`, for `substeps` physics steps."""
         ctrl, model = jnp.clip(action, *self.action_range), self.model_of(task)
 
@@ -242,7 +245,7 @@ class Env(abc.ABC):
         )
         return state.with_vector(x)
 
-    def approximate_step(self, task: Task, state: State, action: jax.Array) -> State:
+    def approximate_step(self, task: TaskT, state: State, action: jax.Array) -> State:
         """Approximates `step` for the planner, which differentiates it; the same as `step` unless overridden."""
         return self.step(task, state, action)
 
@@ -252,21 +255,21 @@ class Env(abc.ABC):
         return jnp.concatenate([data.qpos, data.qvel])
 
     @functools.partial(jax.jit, static_argnums=0)
-    def observe(self, task: Task, state: State) -> Observation:
+    def observe(self, task: TaskT, state: State) -> Observation:
         """Shows what the policy sees: the image [H, W, 3] uint8 (None without vision) and the state [S]."""
         image = self.render(task, state) if self.vision else None
         return Observation(image=image, state=self.robot_state(state))
 
     @functools.partial(jax.jit, static_argnums=0)
-    def render(self, task: Task, state: State) -> jax.Array:
+    def render(self, task: TaskT, state: State) -> jax.Array:
         """Draws the camera's image [H, W, 3] uint8 of the task's scene."""
         return self._draw(self.model_of(task), task, state)
 
-    def film(self, task: Task, states: State) -> jax.Array:
+    def film(self, task: TaskT, states: State) -> jax.Array:
         """Draws images [F, H, W, 3] uint8 of an episode and its outcome; `states` has a leading axis T + 1."""
         return jax.vmap(self.render, in_axes=(None, 0))(task, states)
 
-    def _draw(self, model: mjx.Model, task: Task, state: State) -> jax.Array:
+    def _draw(self, model: mjx.Model, task: TaskT, state: State) -> jax.Array:
         """Draws the image of a state in this model."""
         data = mjx.kinematics(model, self.data(state))
         data = mjx.camlight(model, mjx.com_pos(model, data))

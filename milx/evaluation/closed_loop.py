@@ -24,7 +24,7 @@ from milx.methods.base import Method
 from milx.methods.random import Random
 from milx.trajopt.expert import judge, perform
 from milx.trajopt.ilqr import Options
-from milx.types import Demo, Params, TaskBatch
+from milx.types import Demo, Params, TaskBatch, TaskParams
 
 _LISTENERS = 24
 """Held-out tasks on which `listen` measures, at most."""
@@ -71,10 +71,10 @@ def _run_batch(
     def run_tasks(
         params: Params, task: Task, shown: Task, states: State, action: jax.Array, scene: State, key: jax.Array
     ) -> Trials:
-        def adapt(task: Task, states: State, action: jax.Array) -> Params:
+        def adapt(task: Task, states: State, action: jax.Array) -> TaskParams:
             return method.adapt(params, jax.vmap(functools.partial(render_demo, env, task))(states, action))
 
-        def trial(task_params: Params, task: Task, scene: State, key: jax.Array) -> Trials:
+        def trial(task_params: TaskParams, task: Task, scene: State, key: jax.Array) -> Trials:
             visited, _ = rollout(env, method, task_params, task, scene, key)
             return Trials(env.success(task, visited), env.other_criteria(task, visited), visited)
 
@@ -188,7 +188,7 @@ def evaluate_baselines(env: Env, demos: DemoSet, config: EvalConfig, expert: Dat
     states, _ = map_in_chunks(plan, tuple(twice), expert.plan_batch)
     as_it_is = jax.tree.map(lambda x: jnp.concatenate([x, x]), task)
     success, other = map_in_chunks(functools.partial(judge, env), (as_it_is, states), expert.plan_batch)
-    random = run_trials(env, Random(env.action_size), (), demos, config, key)
+    random = run_trials(env, Random(env.action_size), {}, demos, config, key)
 
     def rates(of_experts: jax.Array, of_random: jax.Array) -> dict[str, float]:
         halves = of_experts.reshape(2, total).mean(axis=1)

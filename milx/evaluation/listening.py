@@ -15,7 +15,7 @@ from milx.core.batching import map_in_groups
 from milx.evaluation.rollout import replay
 from milx.methods.base import Method
 from milx.methods.whitening import MIN_STD
-from milx.types import Demo, Params, TaskBatch
+from milx.types import Demo, Params, TaskBatch, TaskParams
 
 MARGIN = 0.05
 """A policy listens if another task's demonstration makes its error larger by more than this part."""
@@ -45,10 +45,10 @@ def measure(method: Method, params: Params, batch: TaskBatch, most: int | None =
     """
     most = most or len(batch.query.action)
 
-    def adapt(params: Params, support: Demo) -> Params:
+    def adapt(params: Params, support: Demo) -> TaskParams:
         return map_in_groups(functools.partial(method.adapt, params), (support,), most)
 
-    def error(task_params: Params, query: Demo) -> jax.Array:
+    def error(task_params: TaskParams, query: Demo) -> jax.Array:
         return map_in_groups(functools.partial(_squared_error, method), (task_params, query), most)
 
     def error_before(prior: Params, query: Demo) -> jax.Array:
@@ -88,7 +88,7 @@ def in_words(found: dict[str, float]) -> str:
     return f"; error of the actions {', '.join(parts)} demonstration" if parts else ""
 
 
-def _squared_error(method: Method, task_params: Params, query: Demo) -> jax.Array:
+def _squared_error(method: Method, task_params: TaskParams, query: Demo) -> jax.Array:
     """Averages squared errors over the time steps of demonstrations [Q, T, ...]: [A]."""
     action = jax.vmap(functools.partial(replay, method, task_params))(query)
     return jnp.square(action - query.action).mean(axis=(0, 1))

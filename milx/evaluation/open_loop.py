@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from milx.data.recorded import Recorded
 from milx.evaluation.rollout import replay
 from milx.methods import Method
-from milx.types import Demo, Params
+from milx.types import Demo, Params, TaskParams
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
@@ -43,7 +43,7 @@ def task_errors(
     def error(action: jax.Array) -> jax.Array:
         return (jnp.square((action - queries.demo.action) / scale).mean(axis=(1, 2)) * weight).sum()
 
-    def act(task_params: Params) -> jax.Array:
+    def act(task_params: TaskParams) -> jax.Array:
         return jax.lax.map(functools.partial(replay, method, task_params), queries.demo)
 
     errors = {"after": error(act(method.adapt(params, support))), "mean_action": error(mean)}

@@ -5,11 +5,11 @@ import jax.numpy as jnp
 
 from milx.envs.base import Env, State, Task
 from milx.methods.base import Method
-from milx.types import Demo, Memory, Observation, Params
+from milx.types import Demo, Memory, Observation, TaskParams
 
 
 def rollout(
-    env: Env, method: Method, task_params: Params, task: Task, state: State, key: jax.Array
+    env: Env, method: Method, task_params: TaskParams, task: Task, state: State, key: jax.Array
 ) -> tuple[State, Demo]:
     """Lets an adapted policy act for one episode.
 
@@ -37,7 +37,7 @@ def rollout(
     return states, Demo(image=seen.image, state=seen.state, action=actions)
 
 
-def replay(method: Method, task_params: Params, demo: Demo) -> jax.Array:
+def replay(method: Method, task_params: TaskParams, demo: Demo) -> jax.Array:
     """Chooses actions [T, A] by an adapted policy on the observations of one demonstration [T, ...].
 
     A policy that remembers sees them one after the other; any other sees them all at once.

@@ -5,7 +5,7 @@ import abc
 import jax
 
 from milx.methods.whitening import Whitening
-from milx.types import Demo, Memory, Observation, Params, TaskBatch
+from milx.types import Demo, Memory, Observation, Params, TaskBatch, TaskParams
 
 
 class Method(abc.ABC):
@@ -37,16 +37,16 @@ class Method(abc.ABC):
         raise NotImplementedError
 
     @abc.abstractmethod
-    def adapt(self, params: Params, demo: Demo) -> Params:
+    def adapt(self, params: Params, demo: Demo) -> TaskParams:
         """Learns a task from demonstrations with axes [K, T, ...]; returns `task_params`."""
 
-    def unadapted(self, params: Params) -> Params | None:
+    def unadapted(self, params: Params) -> TaskParams | None:
         """Returns `task_params` before any demonstration, with the structure of what `adapt` returns, or None."""
         del params
         return None
 
     @abc.abstractmethod
-    def act(self, task_params: Params, observation: Observation, memory: Memory) -> tuple[jax.Array, Memory]:
+    def act(self, task_params: TaskParams, observation: Observation, memory: Memory) -> tuple[jax.Array, Memory]:
         """Chooses the action [A], in the environment's units, for one observation; returns it and the next memory."""
 
     def initial_memory(self, key: jax.Array) -> Memory:

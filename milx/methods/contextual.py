@@ -20,7 +20,7 @@ from milx.networks.encoders import (
     RecurrentConfig,
     make_context_network,
 )
-from milx.types import Demo, Memory, Observation, Params, Spec, TaskBatch
+from milx.types import Demo, Memory, Observation, Params, Spec, TaskBatch, TaskParams
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -47,7 +47,7 @@ class ContextPolicy(Method):
         actor = calibrate_goal_head(params["actor"], self.image_to_goal, self.goal_indices, whitening)
         return {**params, "actor": actor, "whitening": whitening}
 
-    def adapt(self, params: Params, demo: Demo) -> Params:
+    def adapt(self, params: Params, demo: Demo) -> TaskParams:
         """Encodes demonstrations [K, T, ...]."""
         whitening = jax.lax.stop_gradient(params["whitening"])
         demo = shown(demo, self.config.given, whitening)
@@ -77,7 +77,7 @@ class ContextPolicy(Method):
         loss, metrics = jax.vmap(task_loss)(batch.support, batch.query)
         return loss.mean(), {"loss": loss, **metrics}
 
-    def act(self, task_params: Params, observation: Observation, memory: Memory) -> tuple[jax.Array, Memory]:
+    def act(self, task_params: TaskParams, observation: Observation, memory: Memory) -> tuple[jax.Array, Memory]:
         """Averages the actor's actions over the contexts."""
         whitening, batch = task_params["whitening"], jax.tree.map(lambda x: x[None], observation)
         state = whitening.state(batch.state)

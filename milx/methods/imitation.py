@@ -112,6 +112,6 @@ def calibrate_goal_head(
         return policy
     indices = jnp.array(goal_indices)
     votes = jnp.array(image_to_goal).at[-1].add(-whitening.state_mean[indices]) / whitening.state_scale[indices]
-    heads = {name: policy[name] for name in ("controller", "hindsight") if name in policy}
+    heads: Params = {name: policy[name] for name in ("controller", "hindsight") if name in policy}
     heads = {name: {**part, "goal_head": calibrate(part["goal_head"], votes)} for name, part in heads.items()}
     return {**policy, **heads}

@@ -36,7 +36,7 @@ from milx.methods.whitening import Whitening
 from milx.networks.goal import Goal
 from milx.networks.learned_loss import KINDS
 from milx.networks.policy_network import BIAS_TRANSFORMATION, PolicyConfig, PolicyNetwork, PolicyOutput, make_policy
-from milx.types import Demo, Memory, Observation, Params, Spec, TaskBatch
+from milx.types import Demo, Memory, Observation, Params, Spec, TaskBatch, TaskParams
 
 VARIANTS = ("maml", "anil", "boil", "cavia", "multi_step")
 """Relatives of MAML (Finn et al. 2017): the inner step changes the last layer only (ANIL, Raghu et al. 2020), all but
@@ -127,7 +127,7 @@ class MIL(Method):
             params["inner_log_lr"] = jax.tree.map(lambda _: jnp.zeros(()), params["policy"])
         return params
 
-    def adapt(self, params: Params, demo: Demo) -> Params:
+    def adapt(self, params: Params, demo: Demo) -> TaskParams:
         """Takes the inner gradient steps on demonstrations [K, T, ...]: their gradients are averaged."""
         return {"policy": self._steps(params, demo)[-1], "whitening": params["whitening"]}
 
@@ -163,7 +163,7 @@ class MIL(Method):
 
         return jax.tree_util.tree_map_with_path(adapts, theta)
 
-    def unadapted(self, params: Params) -> Params:
+    def unadapted(self, params: Params) -> TaskParams:
         """Returns the parameters from which every task is learned."""
         return {"policy": params["policy"], "whitening": params["whitening"]}
 
@@ -214,7 +214,7 @@ class MIL(Method):
             loss += self.config.goal_weight * metrics["hindsight_loss"]
         return loss, metrics
 
-    def act(self, task_params: Params, observation: Observation, memory: Memory) -> tuple[jax.Array, Memory]:
+    def act(self, task_params: TaskParams, observation: Observation, memory: Memory) -> tuple[jax.Array, Memory]:
         """Chooses the adapted network's action. The memory is what a target head saw in the first observation."""
         whitening, batch = task_params["whitening"], jax.tree.map(lambda x: x[None], observation)
         target = memory[None] if self.network.has_target else None

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from milx.methods.base import Method
 from milx.methods.whitening import Whitening
-from milx.types import Demo, Memory, Observation, Params, TaskBatch
+from milx.types import Demo, Memory, Observation, Params, TaskBatch, TaskParams
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,7 +22,7 @@ class Random(Method):
 
     def init(self, key: jax.Array, whitening: Whitening) -> Params:
         """Returns no parameters: there is nothing to learn."""
-        return ()
+        return {}
 
     def loss(
         self, params: Params, batch: TaskBatch, progress: jax.Array | float = 1.0
@@ -30,11 +30,11 @@ class Random(Method):
         """Returns zero: there is nothing to learn."""
         return jnp.zeros(()), {"loss": jnp.zeros(len(batch.query.action))}
 
-    def adapt(self, params: Params, demo: Demo) -> Params:
+    def adapt(self, params: Params, demo: Demo) -> TaskParams:
         """Ignores the demonstration."""
-        return ()
+        return {}
 
-    def act(self, task_params: Params, observation: Observation, memory: Memory) -> tuple[jax.Array, Memory]:
+    def act(self, task_params: TaskParams, observation: Observation, memory: Memory) -> tuple[jax.Array, Memory]:
         """Draws an action; the memory is a key."""
         key, next_key = jax.random.split(memory)
         return jax.random.normal(key, (self.action_size,)), next_key

@@ -71,7 +71,7 @@ class PlaceTask:
     texture: Textures
 
 
-class Place(Env):
+class Place(Env[PlaceTask]):
     """A seven-joint arm moves its hand by velocities, three containers, 100x90 pixels, 30 actions of 0.1 s.
 
     The robot's state is 16-dimensional: seven joint angles (rad), the position of the hand's tip (m), and the unit

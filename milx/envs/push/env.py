@@ -71,7 +71,7 @@ class PushTask:
     texture: Textures
 
 
-class Push(Env):
+class Push(Env[PushTask]):
     """Seven torque-controlled joints, two objects that slide and turn, 125x125 pixels, 100 actions of 0.05 s.
 
     The robot's state is 20-dimensional: seven joint angles (rad), seven joint velocities (rad/s), the position of the

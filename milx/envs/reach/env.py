@@ -40,7 +40,7 @@ class ReachTask:
     target: jax.Array
 
 
-class Reach(Env):
+class Reach(Env[ReachTask]):
     """Two joints, three cubes, 80x64 pixels from above, 50 actions of 0.05 s.
 
     The robot's state is 8-dimensional: two joint angles (rad), two joint velocities (rad/s), the fingertip's position
