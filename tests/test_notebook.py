@@ -94,7 +94,7 @@ def test_training_and_adaptation_did_something(executed):
 
 def test_a_task_of_ones_own_is_planned_trained_and_judged(execute):
     notebook = execute("train_your_own_task", steps=4, tasks=2)
-    found = re.search(r"success ([\d.]+)% of 8 trials; baselines and upper bound: (\{.*\})", printed(notebook))
+    found = re.search(r"success ([\d.]+)% of 20 trials; baselines and upper bound: (\{.*\})", printed(notebook))
     assert 0 <= float(found.group(1)) <= 100
     assert set(ast.literal_eval(found.group(2))) == {"random", "task_blind", "expert", "other_demo"}
     (scene,) = code(notebook)[5].outputs

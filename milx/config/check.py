@@ -10,7 +10,7 @@ from typing import Any
 from milx.config.schema import Config
 
 MOST = 10**9
-"""The maximum of every integer field, even where the field itself allows more."""
+"""The maximum of integer fields that declare none."""
 _LARGEST = 1e30
 
 
@@ -61,8 +61,8 @@ def _check_value(name: str, value: Any, hint: Any, limits: Mapping[str, float]) 
 def _check_number(name: str, value: Any, hint: type, limits: Mapping[str, float]) -> None:
     allowed = (int,) if hint is int else (int, float)
     low, high = limits.get("low", 1), limits.get("high", math.inf)
-    most = min(high, MOST if hint is int else _LARGEST)
+    most = high if high < math.inf else MOST if hint is int else _LARGEST
     if not isinstance(value, allowed) or isinstance(value, bool) or not low <= value <= most:
         kind = "a whole number" if hint is int else "a finite number"
-        bounds = f"at least {low}" + ("" if high == math.inf else f" and at most {high}")
+        bounds = f"at least {low}" + (f" and at most {most}" if most < _LARGEST else "")
         raise ValueError(f"{name}: got {value!r}, expected {kind}, {bounds}")

@@ -143,7 +143,8 @@ def check_demo(demo: Demo, spec: Spec, given: str = GIVEN[0]) -> Demo:
     """
     if not isinstance(demo, Demo):
         raise ValueError(f"demo: got {type(demo).__name__}, expected a milx.Demo")
-    leading = {"video+state+action": "action", "video+state": "state", "video": "image"}[given]
+    without_actions = "state" if spec.state_size else "image"
+    leading = {"video+state+action": "action", "video+state": without_actions, "video": "image"}[given]
     axes = {"action": ("A",), "state": ("S",), "image": ("H", "W", "3")}[leading]
     first = _as_array(f"demo.{leading}", getattr(demo, leading))
     lead = first.ndim - len(axes) - 1

@@ -10,6 +10,7 @@ import milx
 from milx import methods
 from milx.config import assemble, registry
 from milx.config.assemble import default_config, make_config, overrides
+from milx.config.check import check_config
 from milx.config.registry import PRESETS
 from milx.types import Spec
 
@@ -110,6 +111,14 @@ def test_fields_are_assigned_by_name_and_only_optional_ones_take_none():
         assemble.assign(config, "train.steps", None)
     with pytest.raises(ValueError, match=r"config\.train\.stepz: no such field"):
         assemble.assign(config, "train.stepz", 1)
+
+
+@pytest.mark.parametrize("seed", [0, 2**32 - 1])
+def test_every_seed_that_the_field_allows_is_accepted(seed):
+    check_config(make_config("reach", preset="cpu", seed=seed))
+    expected = "seed: got 4294967296, expected a whole number, at least 0 and at most 4294967295"
+    with pytest.raises(ValueError, match=expected):
+        check_config(make_config("reach", preset="cpu", seed=2**32))
 
 
 @pytest.mark.parametrize(("env", "preset"), [pair for pair in ALL if pair[1] != "paper"])

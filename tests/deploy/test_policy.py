@@ -232,6 +232,13 @@ def test_a_policy_without_pixels_takes_none(policy):
         check_observation(milx.Observation(good.image[0], good.state[0]), spec)
 
 
+def test_a_policy_without_states_needs_none(policy):
+    spec = dataclasses.replace(policy.spec, state_size=0, goal_indices=())
+    checked = check_demo(dataclasses.replace(good_demo(), state=None), spec, "video+state")
+    np.testing.assert_array_equal(checked.state, np.zeros((1, T, 0)))
+    np.testing.assert_array_equal(checked.image[0], good_demo().image)
+
+
 def test_folder_without_a_run_is_refused(tmp_path):
     with pytest.raises(ValueError, match=r"has no config\.json, expected a folder written by") as error:
         milx.load(tmp_path)

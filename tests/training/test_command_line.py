@@ -73,4 +73,4 @@ def test_help_shows_the_flags_and_their_choices(tmp_path):
     for flag in ("env", "method", "preset", "seed", "workdir"):
         assert re.search(rf"^\s*--(\[no\])?{flag}:", said, re.MULTILINE), flag
     assert "--config.path.to.field=value" in re.sub(r"\s+", "", said)
-    assert "Plans demonstrations, meta-trains, evaluates" in said
+    assert "meta-trains a policy on them, and evaluates it" in said
