@@ -34,5 +34,8 @@ __all__ = [
 def __getattr__(name: str) -> ModuleType:
     """Imports `milx.gym`, which needs Gymnasium, when it is first used."""
     if name == "gym":
-        return importlib.import_module("milx.gym")
+        try:
+            return importlib.import_module("milx.gym")
+        except ModuleNotFoundError as error:
+            raise ImportError("milx.gym needs Gymnasium: pip install 'milx[gym]'") from error
     raise AttributeError(f"module 'milx' has no attribute {name!r}")

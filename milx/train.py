@@ -16,6 +16,7 @@ def main(config: Config, workdir: str) -> None:
     run = make_run(config, workdir)
     run.train()
     run.report(run.evaluate())
+    run.suggest()
 
 
 if __name__ == "__main__":

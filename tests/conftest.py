@@ -72,7 +72,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Scheduling:
 
 @pytest.fixture(scope="session", autouse=True)
 def cache(tmp_path_factory):
-    """Demonstrations are cached for this session only; compiled programs stay where milx puts them.
+    """Caches demonstrations for this session only; compiled programs stay where milx puts them.
 
     Both hold for processes that tests start, too.
     """

@@ -154,7 +154,7 @@ def test_configs(data):
 @cases("flags")
 @given(data=st.data())
 def test_flags(data):
-    """Flags and overrides with any text: a configuration that training would take, or an error that names the flag."""
+    """Gives flags and overrides any text: they make a configuration, or an error that names the flag."""
     fields = assemble.flatten(assemble.to_dict(make_config("reach", preset="cpu")))
     names = ["env", "method", "preset", "seed", "data", "nope", *(f"config.{name}" for name in (*fields, "nope"))]
     literal = JSON.map(repr)

@@ -20,7 +20,7 @@ STEPS = 50
 
 
 def random_demos(env, num_tasks, num_demos):
-    """Wanderings, where nobody planned anything: rendering and learning ask for no more."""
+    """Samples wanderings that nobody planned: rendering and learning ask for no more."""
     import jax
 
     from milx.data import simulated as demos_lib

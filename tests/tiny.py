@@ -9,7 +9,7 @@ QUIET = Console(quiet=True)
 
 
 def tiny_config(seed: int = 0, env: str = "reach") -> Config:
-    """Sizes at which compiling takes far longer than running."""
+    """Returns sizes at which compiling takes far longer than running."""
     config = make_config(env, preset="cpu", seed=seed)
     config.data.tasks, config.data.demos_per_task = 8, 3
     config.data.plan_iterations, config.data.plan_batch = 8, 10  # the quickstart's, which finds the program compiled

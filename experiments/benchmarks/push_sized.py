@@ -140,7 +140,7 @@ class PushSized(Env):
         return state.qpos[7:9]
 
     def success(self, task: Looks, states: State) -> jax.Array:
-        """Always."""
+        """Returns true."""
         return jnp.bool_(True)
 
     def task_blind(self, key: jax.Array, task: Looks) -> Looks:

@@ -33,7 +33,7 @@ _FRAMES = flags.DEFINE_integer("frames", None, "Frames at once; 4,096 on an acce
 
 
 def random_scenes(env: Env, count: int) -> Scene:
-    """Scenes of random states after forward kinematics, with a leading axis."""
+    """Draws scenes of random states after forward kinematics, with a leading axis."""
     task = env.sample_task(jax.random.key(0), "train")
 
     def scene(key: jax.Array) -> Scene:

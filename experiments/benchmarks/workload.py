@@ -36,7 +36,7 @@ def unit_whitening(env: Env) -> Whitening:
 
 
 def random_demos(env: Env, num_tasks: int, num_demos: int) -> DemoSet:
-    """Demonstrations of the right size: random poses, random actions."""
+    """Samples demonstrations of the right size: random poses, random actions."""
     keys = jax.random.split(jax.random.key(0), 3)
     tasks = jax.vmap(env.sample_task, in_axes=(0, None))(jax.random.split(keys[0], num_tasks), "train")
 

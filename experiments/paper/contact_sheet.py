@@ -92,11 +92,11 @@ def main(folder: str) -> None:
     out = pathlib.Path(folder)
     renderer, empty = stage(primitives.SLOTS)
     made = {name: primitives.to_geoms(shape) for name, shape in shapes.SHAPES.items()}
-    names = [(name, split) for split, names in shapes.SPLITS.items() for name in names]
+    names = [(name, split) for split, names in shapes.BY_SPLIT.items() for name in names]
     scenes = [put(empty, made[name], COLORS[split]) for name, split in names]
     draw(renderer, scenes, [name.replace("_", " ") for name, _ in names], out / "shapes.png")
 
-    families = [(name, split) for split, names in textures.SPLITS.items() for name in names]
+    families = [(name, split) for split, names in textures.BY_SPLIT.items() for name in names]
     keys = jax.random.split(jax.random.key(0), (len(families), COLUMNS))
     scenes = [
         wear(put(empty, made[SHOWN], COLORS[split]), name, key)
@@ -106,7 +106,7 @@ def main(folder: str) -> None:
     draw(renderer, scenes, [name for name, _ in families for _ in range(COLUMNS)], out / "textures.png")
 
     renderer, empty = stage(containers.SLOTS)
-    names = [(name, split) for split, names in containers.SPLITS.items() for name in names]
+    names = [(name, split) for split, names in containers.BY_SPLIT.items() for name in names]
     scenes = [put(empty, containers.to_geoms(containers.CONTAINERS[name]), COLORS[split]) for name, split in names]
     draw(renderer, scenes, [name.replace("_", " ") for name, _ in names], out / "containers.png")
 

@@ -32,7 +32,7 @@ _SCENES = flags.DEFINE_integer("scenes", 512, "Scenes of each split, each of ano
 
 
 def compare(name: str, scenes: int) -> list[dict[str, Any]]:
-    """Success of an expert for each split and noise, with baselines beside the controller's.
+    """Measures the success of an expert for each split and noise, with baselines beside the controller's.
 
     The seconds of the first entry include compilation.
     """

@@ -120,7 +120,7 @@ def _of_seeds(found: dict[str, dict[str, Any]], name: str) -> list[dict[str, Any
 
 
 def judged(run: dict[str, Any], criterion: str) -> dict[str, Any]:
-    """Success, interval and baselines of a result file by one of its criteria."""
+    """Selects success, interval and baselines of a result file by one of its criteria."""
     return run if criterion == run["criterion"] else run["other_criteria"][criterion]
 
 

@@ -79,7 +79,7 @@ def writing(workdir: pathlib.Path, before: set[str]) -> bool:
 
 
 def unfinished(workdir: pathlib.Path) -> set[str]:
-    """Checkpoints that are not complete."""
+    """Lists checkpoints that are not complete."""
     checkpoints = workdir / "checkpoints"
     return {str(path) for pattern in ("*tmp*", "*/checksums.json.partial") for path in checkpoints.glob(pattern)}
 

@@ -23,7 +23,8 @@ def make_config(env: str, method: str = "mil", preset: str = "fast", seed: int =
     """Builds the configuration of a preset.
 
     Raises:
-        ValueError: for an environment, method or preset that does not exist; the message lists those that do.
+        ValueError: for an environment, method or preset that does not exist (the message lists those that do), or a
+            preset with a field that no method has.
     """
     if env not in PRESETS:
         raise ValueError(f"env: got {env!r}, expected one of {', '.join(PRESETS)}")
@@ -31,9 +32,9 @@ def make_config(env: str, method: str = "mil", preset: str = "fast", seed: int =
         raise ValueError(f"preset: got {preset!r}, expected one of {', '.join(PRESETS[env])}")
     config = default_config(method)
     config.env_name, config.preset, config.seed = env, preset, seed
-    known = fields(config)
+    known, of_others = fields(config), {name for other in METHODS for name in fields(default_config(other))}
     for name, value in (PRESETS[env][preset] | METHODS[method].overrides).items():
-        if name in known:
+        if name in known or name not in of_others:  # `assign` refuses what no method has
             assign(config, name, value)
     return config
 

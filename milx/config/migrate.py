@@ -31,14 +31,14 @@ def migrate(values: dict[str, Any]) -> dict[str, Any]:
     if version not in (1, VERSION):
         raise ValueError(f"config_version: got {version!r}, expected at most {VERSION}: made by a later milx")
     values = {name: value for name, value in values.items() if name != "config_version"}
-    return values if version == VERSION or "method" in values else _from_version_1(values)
+    return values if version == VERSION else _from_version_1(values)
 
 
 def _from_version_1(values: dict[str, Any]) -> dict[str, Any]:
     groups = {name: values.get(name, {}) for name in ("mil", "network", "train")}
     if not all(isinstance(group, dict) for group in groups.values()):
         return values  # the caller rejects a group that is not a dictionary
-    method_name, (mil, network, train) = values.get("method_name", "mil"), map(dict, groups.values())
+    method_name, (mil, network, train) = str(values.get("method_name", "mil")), map(dict, groups.values())
     if "redraw_appearance" in train:  # the field's earlier name
         train["redraw"] = train.pop("redraw_appearance")
     steps = {"imitation_steps": train.pop("imitation_steps")} if "imitation_steps" in train else {}

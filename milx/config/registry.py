@@ -8,6 +8,7 @@ entry point in the group "milx.plugins":
 """
 
 import importlib.metadata
+import warnings
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -44,20 +45,24 @@ PRESETS: dict[str, dict[str, Overrides]] = {}
 """Presets by environment and name: the values in which they differ from the defaults.
 
 Fields that a method does not have are ignored."""
+DURATIONS: dict[str, dict[str, str]] = {}
+"""How long a run took and on what hardware, in words, by environment and preset; measured for MIL only."""
 
 
-def register_env(env: Any, presets: dict[str, Overrides]) -> None:
+def register_env(env: Any, presets: dict[str, Overrides], durations: dict[str, str] | None = None) -> None:
     """Makes an environment available to `milx.make` and `--env`.
 
     Args:
         env: a subclass of `milx.envs.base.Env`; it is registered under its attribute `name`.
         presets: by name. Launchers use "fast" by default with an accelerator, and "cpu" without one.
+        durations: by preset, how long a run of MIL took and on what hardware; launchers say so.
 
     Raises:
         ValueError: if the name is already registered.
     """
     _add(ENVS, "env", env.name, env)
     register_presets(env.name, presets)
+    DURATIONS[env.name] = durations or {}
 
 
 def register_presets(env: str, presets: dict[str, Overrides]) -> None:
@@ -92,9 +97,16 @@ def register_method(
 
 
 def load_plugins() -> None:
-    """Imports the packages that have an entry point in the group PLUGINS."""
+    """Imports the packages that have an entry point in the group PLUGINS.
+
+    Warns:
+        RuntimeWarning: if one of them cannot be imported; milx goes on without it.
+    """
     for plugin in importlib.metadata.entry_points(group=PLUGINS):
-        plugin.load()
+        try:
+            plugin.load()
+        except Exception as error:  # whatever a package does wrong, milx's own environments and methods work
+            warnings.warn(f"plugin {plugin.name} = {plugin.value}: {error!r}", RuntimeWarning, stacklevel=2)
 
 
 def _add(registry: dict[str, Any], kind: str, name: str, value: Any) -> None:

@@ -6,14 +6,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from milx.core import parallel
+from milx.core import parallel, progress
 
 
 def map_in_chunks(function: Callable[..., Any], inputs: tuple, size: int) -> Any:
     """Calls `function(*inputs)` on slices of the leading axis and joins the results.
 
     All calls have the same size, so the function is compiled only once. The last slice is filled up by repeating the
-    last entry.
+    last entry. After each call the entries count as done in `milx.core.progress`.
 
     Args:
         function: maps pytrees with leading axis [size] to a pytree with leading axis [size].
@@ -27,7 +27,8 @@ def map_in_chunks(function: Callable[..., Any], inputs: tuple, size: int) -> Any
     results = []
     for start in range(0, total, size):
         index = jnp.minimum(jnp.arange(start, start + size), total - 1)
-        result = function(*jax.tree.map(lambda x, index=index: x[index], inputs))
+        result = jax.block_until_ready(function(*jax.tree.map(lambda x, index=index: x[index], inputs)))
+        progress.advance(size)
         results.append(jax.tree.map(lambda x, start=start: x[: total - start], result))
     return jax.tree.map(lambda *xs: jnp.concatenate(xs), *results)
 

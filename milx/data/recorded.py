@@ -37,7 +37,7 @@ class Recorded:
 
 
 def shape_of(data: DataSet, num_tasks: int, num_demos: int, horizon: int) -> Recorded:
-    """Shapes and types of `read_demos`'s result."""
+    """Returns shapes and types of `read_demos`'s result."""
     lead, head = (num_tasks, num_demos, horizon), data.header
     image = None if head.image_shape is None else jax.ShapeDtypeStruct((*lead, *head.image_shape, 3), np.uint8)
     state, action = (jax.ShapeDtypeStruct((*lead, size), np.float32) for size in (head.state_size, head.action_size))

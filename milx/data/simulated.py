@@ -100,7 +100,7 @@ def _of_one_task(demos: DemoSet) -> tuple[State, jax.Array]:
 
 
 def _without_diverged(states: State, action: jax.Array, success: jax.Array) -> tuple[State, jax.Array, jax.Array]:
-    """Zeros, which count as failed, in place of what is not finite of M demonstrations; says how many there are."""
+    """Zeros what is not finite of M demonstrations, so that they count as failed; says how many there are."""
     flat = [x.reshape(len(x), -1) for x in jax.tree.leaves((states, action)) if x.size]
     finite = jnp.stack([jnp.isfinite(x).all(axis=1) for x in flat]).all(axis=0)
     if diverged := int((~finite).sum()):
@@ -207,7 +207,7 @@ def sampler(env: Env, train: TrainConfig) -> Callable[[DemoSet, jax.Array], Task
 
 
 def shapes(env: Env, num_tasks: int, num_demos: int) -> DemoSet:
-    """Shapes and types of a set of D = `num_demos` demonstrations of each of N = `num_tasks` tasks."""
+    """Returns shapes and types of a set of D = `num_demos` demonstrations of each of N = `num_tasks` tasks."""
 
     def expand(tree: Any, *axes: int) -> Any:
         return jax.tree.map(lambda x: jax.ShapeDtypeStruct((*axes, *x.shape), x.dtype), tree)

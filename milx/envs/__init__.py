@@ -1,11 +1,11 @@
 """Environments by name."""
 
-from milx.config.registry import ENVS, register_env, register_presets
+from milx.config.registry import ENVS, register_env
 from milx.envs.base import Env, State, Task
 from milx.envs.place.env import Place
 from milx.envs.place.presets import PLACE
 from milx.envs.push.env import Push
-from milx.envs.push.presets import PUSH, RECORDED
+from milx.envs.push.presets import PUSH
 from milx.envs.reach.env import Reach, ReachState
 from milx.envs.reach.presets import REACH, REACH_STATE
 
@@ -15,7 +15,6 @@ register_env(Reach, REACH)
 register_env(ReachState, REACH_STATE)
 register_env(Push, PUSH)
 register_env(Place, PLACE)
-register_presets("recorded", RECORDED)
 
 
 def make(name: str, image_shape: tuple[int, int] | None = None, action_cost: float | None = None) -> Env:

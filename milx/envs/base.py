@@ -25,6 +25,8 @@ Task = Any
 """A pytree of arrays: what an environment means by a task."""
 
 TaskT = TypeVar("TaskT")
+OUT_OF_THE_WAY = (0.0, 0.0, -10.0)
+"""Where geoms are put that a task does not use (m)."""
 ASSETS = pathlib.Path(__file__).parent / "assets"
 
 
@@ -202,7 +204,7 @@ class Env(abc.ABC, Generic[TaskT]):
         """Tells whether an episode succeeded. `states` has a leading axis T + 1; returns a bool scalar."""
 
     def other_criteria(self, task: TaskT, states: State) -> dict[str, jax.Array]:
-        """Success by other measures, by what they ask for; reported beside, none unless overridden."""
+        """Judges the episode by other criteria, by name; reported beside success, none unless overridden."""
         return {}
 
     @abc.abstractmethod

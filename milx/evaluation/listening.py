@@ -25,7 +25,7 @@ _SMALLEST = 1e-3
 
 
 def measure(method: Method, params: Params, batch: TaskBatch, most: int | None = None) -> dict[str, jax.Array]:
-    """Errors of the actions on the queries of N tasks, and the size of the step; to be called inside `jax.jit`.
+    """Measures errors of the actions on the queries of N tasks, and the size of the step, inside `jax.jit`.
 
     Errors are squared, and divided by the variance of the queries' actions (entry by entry, at least MIN_STD squared,
     then averaged): 1 is what the best constant action has. On reach_state, which has three tasks, the other task is the
@@ -76,7 +76,7 @@ def is_deaf(found: dict[str, float]) -> bool:
 
 def advice(has_inner_step: bool) -> str:
     """Says what to try when a run does not listen."""
-    remedies = "more tasks in a meta-batch (train.meta_batch), or whitened actions (mil.whiten_actions)"
+    remedies = "more tasks in a meta-batch (train.meta_batch), or whitened actions (method.whiten_actions)"
     if has_inner_step:
         remedies = f"imitation first (method.imitation_steps), another method.inner_lr, {remedies}"
     return f"the policy does not listen: another task's demonstration does as well as its own. Try {remedies}"

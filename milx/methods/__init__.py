@@ -51,6 +51,6 @@ def make(config: Config, spec: Spec) -> Method:
 
 
 def params_like(method: Method, spec: Spec) -> Params:
-    """Shapes and types of a method's parameters."""
+    """Returns shapes and types of a method's parameters."""
     state, action = (jax.ShapeDtypeStruct((size,), np.float32) for size in (spec.state_size, spec.action_size))
     return jax.eval_shape(method.init, jax.random.key(0), Whitening(state, state, action, action))

@@ -14,7 +14,7 @@ from milx.types import Demo, Params, Spec
 
 
 def shown(demo: Demo, given: str, whitening: Whitening) -> Demo:
-    """Demonstrations [K, T, ...] without what is not `given` (`MethodConfig.given`): their mean stands in its place."""
+    """Replaces what is not `given` (`MethodConfig.given`) of demonstrations [K, T, ...] by its mean."""
     if given == GIVEN[0]:
         return demo
     shape = (demo.state if demo.image is None else demo.image).shape[:2]
@@ -38,12 +38,18 @@ def behavioral_cloning(
     whitening: Whitening,
     goal_indices: tuple[int, ...],
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """Computes the mean squared error of the actions (eq. 2), plus that of the goal or target head if there is one.
+    """Computes the imitation loss of demonstrations (eq. 2), with those of a goal head and a target head.
+
+        L = mean((m (a - a_hat))^2) + w (L_goal + L_target)
+
+    The mean is over demonstrations, time steps and entries of the whitened action; m is `config.loss_scale` and w is
+    `config.goal_weight`. L_goal is the goal head's mean negative log-likelihood, and L_target is the target head's mean
+    squared error.
 
     Args:
         config: scale and weight of the losses.
         output: what the network said of all time steps of `demo`, one after the other.
-        action: [K T, A], the head that is meant.
+        action: [K T, A], the whitened actions a_hat of the head that the loss is about.
         demo: demonstrations [K, T, ...].
         whitening: of `demo`.
         goal_indices: entries of the state that the goal head predicts.

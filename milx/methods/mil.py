@@ -261,7 +261,7 @@ class MIL(Method):
     def imitation_loss(
         self, theta: Params, whitening: Whitening, demo: Demo, inner: bool = False
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """Computes the imitation loss (eq. 2) on demonstrations [K, T, ...], plus that of a goal head if there is one.
+        """Computes `imitation.behavioral_cloning` of the network on demonstrations [K, T, ...].
 
         `inner` selects the head of the inner loss. Returns the sum and its parts.
         """

@@ -43,7 +43,7 @@ class Whitening:
 
 
 def fit(state: jax.Array, action: jax.Array, whiten_actions: bool) -> Whitening:
-    """Statistics over all leading axes of states [..., S] and actions [..., A] of the training tasks.
+    """Computes statistics over all leading axes of states [..., S] and actions [..., A] of the training tasks.
 
     With `whiten_actions` false, actions pass unchanged.
     """

@@ -75,7 +75,7 @@ def _read(file: pathlib.Path) -> dict[str, np.ndarray]:
 
 
 def cluster(images: np.ndarray, config: NetworkConfig) -> Filters:
-    """Filters from the clusters of the images' patches; the same for the same images.
+    """Makes filters of the clusters of the images' patches; the same for the same images.
 
     Args:
         images: [N, H, W, 3] uint8.

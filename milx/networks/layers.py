@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 
 def same_padding(size: int, kernel: int, stride: int) -> tuple[int, int]:
-    """Zeros before and after an axis so that the output has ceil(size / stride) entries (TensorFlow's SAME)."""
+    """Computes the zeros before and after an axis for ceil(size / stride) outputs (TensorFlow's SAME)."""
     total = max((-(-size // stride) - 1) * stride + kernel - size, 0)
     return total // 2, total - total // 2
 

@@ -121,14 +121,14 @@ def enter(kind: Kind, rows: tuple[Vector, ...], stretch: jax.Array, start: Vecto
 
 
 def _slab(o: jax.Array, d: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Distances at which a ray enters and leaves |coordinate| <= 1."""
+    """Computes the distances at which a ray enters and leaves |coordinate| <= 1."""
     inverse = 1 / jnp.where(jnp.abs(d) < _TINY, _TINY, d)
     middle = -o * inverse
     return middle - jnp.abs(inverse), middle + jnp.abs(inverse)
 
 
 def _round(o: Vector, d: Vector) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Distances at which a ray enters and leaves the unit ball (the disc, given two coordinates), and whether it does.
+    """Computes where a ray enters and leaves the unit ball (the disc, given two coordinates), and whether it does.
 
     Measured from the ray's closest point to the center, which keeps float32 accurate for small shapes far away, where
     the textbook discriminant cancels.

@@ -56,7 +56,7 @@ class Frame:
 
 
 def to_uint8(color: jax.Array) -> jax.Array:
-    """Colors in [0, 1] as uint8 in [0, 255], rounded."""
+    """Rounds colors in [0, 1] to uint8 in [0, 255]."""
     return jnp.round(255 * jnp.clip(color, 0.0, 1.0)).astype(jnp.uint8)
 
 
@@ -230,7 +230,7 @@ def _in_camera(texture: Textures, scene: Scene) -> Textures:
 
 
 def _rotate(matrix: jax.Array, vector: jax.Array) -> jax.Array:
-    """Matrices [..., 3, 3] on vectors [..., 3], in full precision on every device."""
+    """Multiplies matrices [..., 3, 3] by vectors [..., 3], in full precision on every device."""
     return jnp.einsum("...ij,...j->...i", matrix, vector, precision=jax.lax.Precision.HIGHEST)
 
 
@@ -270,7 +270,7 @@ def _find_camera(model: mujoco.MjModel, camera: str | int) -> int:
 
 
 def _group_geoms(model: mujoco.MjModel) -> dict[raycast.Kind, np.ndarray]:
-    """Ids of the shown geoms by kind, the largest group last as `raycast.nearest` prefers.
+    """Groups the ids of the shown geoms by kind, the largest group last as `raycast.nearest` prefers.
 
     Raises:
         ValueError: a shown geom is no primitive, or no geom is shown.

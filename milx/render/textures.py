@@ -27,7 +27,7 @@ class Textures(NamedTuple):
     Attributes:
         family: int32, index into FAMILIES.
         rgb: [3] the second color, in [0, 1].
-        frame: [3, 4] linear part and offset of the map from metres, in the thing's frame or the world's, to the
+        frame: [3, 4] linear part and offset of the map from meters, in the thing's frame or the world's, to the
             family's units.
     """
 
@@ -52,7 +52,7 @@ def _edge(x: jax.Array, sharpness: float) -> jax.Array:
 
 
 def _noise(p: Vector) -> jax.Array:
-    """Waves in directions without a common period, each bent by the one before."""
+    """Sums waves in directions without a common period, each bent by the one before."""
     total = bend = jnp.zeros_like(p[0])
     for x, y, z, phase in _WAVES:
         bend = jnp.sin(4 * (x * p[0] + y * p[1] + z * p[2]) + phase + 1.5 * bend)
@@ -82,7 +82,7 @@ FAMILIES: dict[str, Callable[[Vector], jax.Array]] = {
 }
 """How much of the second color shows, in [0, 1], from places in the family's units."""
 
-SPLITS: dict[str, tuple[str, ...]] = {
+BY_SPLIT: dict[str, tuple[str, ...]] = {
     "train": ("plain", "stripes", "checks", "dots", "noise", "marble"),
     "validation": ("waves", "plaid"),
     "test": ("rings", "bricks", "zigzag"),
@@ -100,10 +100,10 @@ def _draw_turn(key: jax.Array) -> jax.Array:
 
 
 def draw(key: jax.Array, split: str) -> Textures:
-    """Samples a texture of a split's (a key of SPLITS) families, with any size, rotation, shift and color."""
+    """Samples a texture of a split's (a key of BY_SPLIT) families, with any size, rotation, shift and color."""
     names = list(FAMILIES)
     family_key, turn_key, period_key, shift_key, color_key = jax.random.split(key, 5)
-    family = jax.random.choice(family_key, jnp.array([names.index(name) for name in SPLITS[split]]))
+    family = jax.random.choice(family_key, jnp.array([names.index(name) for name in BY_SPLIT[split]]))
     turn = _draw_turn(turn_key)
     period = jax.random.uniform(period_key, minval=PERIOD[0], maxval=PERIOD[1])
     shift = jax.random.uniform(shift_key, (3, 1))

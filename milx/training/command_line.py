@@ -1,6 +1,7 @@
 """What the launchers share: flags that everybody sets, and overrides of single configuration fields."""
 
 import functools
+import os
 import pathlib
 import sys
 from collections.abc import Callable, Sequence
@@ -10,9 +11,10 @@ from absl import app, flags, logging
 from ml_collections import config_flags
 
 from milx.config import assemble
-from milx.config.registry import PRESETS, load_plugins
+from milx.config.registry import DURATIONS, PRESETS, load_plugins
 from milx.config.schema import Config
 from milx.core import parallel, platform
+from milx.data import RECORDED
 from milx.envs import ENVS
 from milx.methods import METHODS
 from milx.training import recorded, signals
@@ -45,7 +47,10 @@ def define_flags(values: flags.FlagValues = FLAGS) -> None:
 
 
 def run(main: Callable[[Config, str], None]) -> None:
-    """Parses the command line and calls `main(config, workdir)`; bad input ends with a message, not a traceback."""
+    """Parses the command line, says what will be done, and calls `main(config, workdir)`.
+
+    Bad input ends with a message, not a traceback.
+    """
     platform.configure()
 
     def parse_or_exit(argv: Sequence[str]) -> list[str]:
@@ -55,22 +60,37 @@ def run(main: Callable[[Config, str], None]) -> None:
             sys.exit(f"milx: {error}")
 
     def start(argv: Sequence[str]) -> None:
-        logging.set_verbosity(logging.WARNING)
+        logging.set_verbosity(logging.ERROR)  # Orbax warns of what is meant so
         if len(argv) > 1:
             raise app.UsageError(f"unexpected argument {argv[1]!r}")
         config = FLAGS.config
-        if FLAGS.preset is None:
-            others = ", ".join(f"--preset={name}" for name in PRESETS[config.env_name] if name != config.preset)
-            print(f"Running on {jax.default_backend()} with its default, --preset={config.preset}; also: {others}.")
         what = config.env_name if FLAGS.data is None else pathlib.Path(FLAGS.data).resolve().name
-        name = f"{what}-{config.method_name}-{config.preset}-{config.seed}"
+        workdir = FLAGS.workdir or f"runs/{what}-{config.method_name}-{config.preset}-{config.seed}"
+        if parallel.is_first_host():
+            print(_describe(config, what, workdir), flush=True)
         try:
             with signals.Stop().listen():
-                main(config, FLAGS.workdir or f"runs/{name}")
+                main(config, workdir)
         except (ValueError, OSError) as error:
             sys.exit(f"milx: {error}")
 
     app.run(start, flags_parser=parse_or_exit)
+
+
+def _describe(config: Config, what: str, workdir: str) -> str:
+    """Says what will be done, on what hardware, and how long that took where it was measured."""
+    device = jax.devices()[0]
+    cores = f"{os.cpu_count()} CPU cores"
+    hardware = cores if device.platform == "cpu" else f"{jax.device_count()} x {device.device_kind}"
+    name = f"{config.method_name} on {what}, preset {config.preset}, seed {config.seed}"
+    said = [f"{name}, with {hardware}, in {workdir}."]
+    others = [f"--preset={name}" for name in PRESETS[config.env_name] if name != config.preset]
+    if FLAGS.preset is None:
+        said.append(f"The preset is the default here; also: {', '.join(others)}.")
+    duration = DURATIONS.get(config.env_name, {}).get(config.preset)
+    if duration and config.method_name == "mil" and not assemble.overrides(config):
+        said.append(f"This took {duration}.")
+    return "milx: " + " ".join(said)
 
 
 def parse(argv: Sequence[str], values: flags.FlagValues = FLAGS) -> list[str]:
@@ -81,10 +101,15 @@ def parse(argv: Sequence[str], values: flags.FlagValues = FLAGS) -> list[str]:
     """
     own = [arg for arg in argv if not arg.startswith(("--config", "-config"))]
     values(own)
-    parallel.join_hosts(values.coordinator, values.num_processes, values.process_id)
+    hosts = values.coordinator, values.num_processes, values.process_id
+    if None in hosts and hosts != (None, None, None):
+        raise flags.Error("--coordinator, --num_processes and --process_id: got some of them, expected all or none")
+    parallel.join_hosts(*hosts)
     load_plugins()
     preset = values.preset or ("cpu" if jax.default_backend() == "cpu" else "fast")
     try:
+        if values.data is None and values.env == RECORDED:
+            raise flags.Error(f"--env: got {RECORDED!r}, expected --data=FOLDER, the folder of the demonstrations")
         if values.data is None:
             config = assemble.make_config(values.env, values.method, preset, values.seed)
         else:
@@ -106,8 +131,12 @@ def parse(argv: Sequence[str], values: flags.FlagValues = FLAGS) -> list[str]:
 def _check_fields(argv: Sequence[str], config: Config) -> None:
     """Raises flags.Error for --config.NAME where there is no such field; lists those that exist."""
     known = assemble.fields(config)
+    unread = ("env.", "data.") if config.env_name == RECORDED else ("recorded.",)
     for arg in argv[1:]:
         name = arg.lstrip("-").split("=")[0]
+        if name.removeprefix("config.").startswith(unread) and name.startswith("config."):
+            where = "without --data" if config.env_name == RECORDED else "with --data"
+            raise flags.Error(f"--{name}: expected only {where}; nothing reads it here")
         if name.startswith("config.") and (field := name.removeprefix("config.")) in _OWN_FLAGS:
             raise flags.Error(f"--{name}: expected --{_OWN_FLAGS[field]}, which also chooses the defaults")
         if name.startswith("config.") and name.removeprefix("config.") not in known:

@@ -5,7 +5,8 @@ import pathlib
 from rich.console import Console
 
 from milx.config.schema import Config
-from milx.training.recorded import RECORDED, RecordedRun
+from milx.data import RECORDED
+from milx.training.recorded import RecordedRun
 from milx.training.run import Run
 from milx.training.simulated import SimulatedRun
 

@@ -51,7 +51,7 @@ class Clock:
         self.seconds[name] += time.perf_counter() - began
 
     def elapsed(self) -> dict[str, float]:
-        """Seconds until now, earlier sessions included."""
+        """Returns the seconds until now, earlier sessions included."""
         now = time.perf_counter()
         self.seconds["total"] += now - self._began
         self._began = now

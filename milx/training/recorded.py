@@ -17,6 +17,7 @@ from rich.console import Console
 from milx.config import assemble
 from milx.config.check import check_config
 from milx.config.schema import GIVEN, Config
+from milx.data import RECORDED
 from milx.data.dataset import DataSet, spread
 from milx.data.recorded import MOST_DEMOS, Recorded, Shards, read_demos, sample_batch, with_goals
 from milx.evaluation import plots, results
@@ -26,9 +27,6 @@ from milx.training.metrics import read_metrics
 from milx.training.run import Run
 from milx.training.state import Training
 from milx.types import SPEC_FILE, Demo, Params, Spec, TaskBatch
-
-RECORDED = "recorded"
-"""The value of `config.env_name` that stands for recorded demonstrations."""
 
 
 def make_config(path: str | pathlib.Path, method: str = "mil", preset: str = "fast", seed: int = 0) -> Config:
@@ -95,9 +93,7 @@ class RecordedRun(Run):
         check_config(config)
         self.data = DataSet(config.recorded.path)
         settings, train = config.recorded, config.train
-        if settings.horizon < 1:
-            raise ValueError(f"recorded.horizon: got {settings.horizon}, expected at least 1")
-        if bad := [i for i in settings.goal_indices if not 0 <= i < self.data.header.state_size]:
+        if bad := [i for i in settings.goal_indices if i >= self.data.header.state_size]:
             raise ValueError(f"recorded.goal_indices: got {bad[0]}, expected less than {self.data.header.state_size}")
         self.given_action = config.method.given == GIVEN[0]
         for field, shots in (("train", train.shots), ("evaluation", config.evaluation.shots)):
@@ -135,7 +131,7 @@ class RecordedRun(Run):
         return read_vectors(self.data, self.shards.tasks, self.config.recorded.horizon)
 
     def _load(self) -> Training:
-        with self.clock("demos"), self.console.status("reading demonstrations"):
+        with self.clock("demos"), self.phase("reading demonstrations"):
             state, action = self._vectors
             statistics = whitening.fit(jnp.asarray(state), jnp.asarray(action), self.config.method.whiten_actions)
             dataset_hash = self.data.fingerprint()
@@ -160,7 +156,7 @@ class RecordedRun(Run):
         return 1 - heard["own_demo"], heard
 
     def _judge(self, params: Params) -> tuple[dict[str, Any], Callable[[dict[str, Any]], None]]:
-        with self.clock("evaluate"):
+        with self.clock("evaluate"), self.phase("evaluating the policy"):
             errors = self._errors(params, "test")
         training = self.shards.tasks
         found = {
@@ -177,6 +173,10 @@ class RecordedRun(Run):
             read_metrics(metrics), result, self.folder / "learning_curve.png"
         )
         return found, draw
+
+    @property
+    def _next(self) -> dict[str, str]:
+        return super()._next | {"export the policy": f"python -m milx.export {self.folder} exported"}
 
     def report(self, result: dict[str, Any]) -> None:
         """Prints the errors of the actions."""

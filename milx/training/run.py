@@ -11,23 +11,22 @@ learning_curve.png
 
 import abc
 import contextlib
-import functools
 import pathlib
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import AbstractContextManager
 from typing import Any
 
 import jax
 import numpy as np
 import rich.markup
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from milx import methods
 from milx.config import assemble
 from milx.config.schema import Config
-from milx.core import parallel, platform
+from milx.core import parallel, platform, progress
 from milx.core.checkpoint import UNVALIDATED, Checkpoints
 from milx.evaluation import listening, results
 from milx.methods import params_like
@@ -94,7 +93,7 @@ class Run(abc.ABC):
 
     @abc.abstractmethod
     def _shapes(self) -> Any:
-        """Shapes and types of the data of `Training.at`."""
+        """Returns shapes and types of the data of `Training.at`."""
 
     @abc.abstractmethod
     def _validate(self, params: Params) -> tuple[float, dict[str, float]]:
@@ -144,32 +143,37 @@ class Run(abc.ABC):
             compiled = self._compile_in_background()
             training = self._load()
             state, key = self._start(training, checkpoints)
-            with self.clock("compile"):
+            with self.clock("compile"), self.phase("compiling the training program"):
                 scan = compiled.result()
             metrics = MetricsWriter(self.folder, int(state.step), self._warn)
-            with contextlib.closing(metrics), self._progress(config.steps, int(state.step)) as show:
-                hooks = self._hooks(metrics, show, training.dataset_hash)
+            with contextlib.closing(metrics), self.phase("meta-training", config.steps, int(state.step)):
+                hooks = self._hooks(metrics, training.dataset_hash)
                 state = loop.fit(scan, state, key, training, config, checkpoints, hooks, self.clock, stop)
         if int(state.step) < config.steps:
             print(f"milx: stopped at step {int(state.step)}; the same command goes on from there", flush=True)
             raise SystemExit(0)
 
-    def _hooks(self, metrics: MetricsWriter, show: Callable[..., None], dataset_hash: str) -> loop.Hooks:
+    def phase(self, description: str, total: int | None = None, done: int = 0) -> AbstractContextManager[None]:
+        """Shows a phase on the console, as `milx.core.progress.phase` does."""
+        return progress.phase(self.console, description, total, done)
+
+    def _hooks(self, metrics: MetricsWriter, dataset_hash: str) -> loop.Hooks:
         config, first = self.config.train, self.method.imitation_steps
 
         def log(step: int, values: dict[str, float]) -> None:
             metrics.write(step, values)
-            show(completed=step, loss=values["loss"], rate=values["steps_per_s"])
+            progress.advance(config.log_every, f"loss {values['loss']:.4f}")
             if values["skipped"]:
                 self._warn(_describe_skipped(values, step))
 
         def validate(state: TrainState) -> float:
-            step, (score, heard) = int(state.step), self._validate(state.params)
+            with self.phase("validating"):
+                step, (score, heard) = int(state.step), self._validate(state.params)
             values = {self.metric: score, **heard}
             metrics.write(step, {f"validation_{name}": value for name, value in values.items()})
             self.console.print(f"step {step}: validation {self.metric} {score:.1%}{listening.in_words(heard)}")
             if 5 * (step - first) >= config.steps - first and listening.is_deaf(heard):
-                self._warn(listening.advice(has_inner_step=self.config.method_name == "mil"))
+                self._warn(listening.advice(has_inner_step=hasattr(self.config.method, "inner_lr")))
             return score
 
         def save(write: Callable[..., bool], state: TrainState, score: float) -> bool:
@@ -198,6 +202,26 @@ class Run(abc.ABC):
         results.write_json(self.folder / "evaluation.json", result)
         draw(result)
         return result
+
+    def suggest(self) -> None:
+        """Prints which files the run has left, and the commands that one wants next."""
+        for lines in (self._files, self._next):
+            width = max(map(len, lines))
+            for name, text in lines.items():
+                self.console.print(f"  {name:{width}}  {text}", highlight=False, markup=False, soft_wrap=True)
+
+    @property
+    def _files(self) -> dict[str, str]:
+        names = {
+            "checkpoints/": "the latest checkpoint, and the best by validation",
+            "evaluation.json": "this result",
+            "learning_curve.png": "the training as a plot",
+        }
+        return {f"{self.folder}/{name}": text for name, text in names.items()}
+
+    @property
+    def _next(self) -> dict[str, str]:
+        return {"load the policy": f"python -ic 'import milx; policy = milx.load(\"{self.folder}\")'"}
 
     @property
     def _params_like(self) -> Params:
@@ -242,17 +266,3 @@ class Run(abc.ABC):
                 raise ValueError(f"workdir: {self.folder} holds another run: {'; '.join(changed)}")
         else:
             results.write_json(path, mine)
-
-    @contextlib.contextmanager
-    def _progress(self, steps: int, done: int) -> Iterator[Callable[..., None]]:
-        """Shows a bar on the console, and yields a function that updates it."""
-        columns = (
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("loss {task.fields[loss]:.4f}  {task.fields[rate]:.1f} steps/s"),
-            TimeRemainingColumn(),
-        )
-        with Progress(*columns, console=self.console) as progress:
-            bar = progress.add_task("meta-train", total=steps, completed=done, loss=float("nan"), rate=0)
-            yield functools.partial(progress.update, bar)

@@ -4,7 +4,9 @@ A run's folder then holds a video, too: rollouts.gif.
 """
 
 import functools
+import math
 import pathlib
+import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -30,15 +32,25 @@ from milx.types import SPLITS, Params
 
 EVALUATION_SEED = 2017
 """Validation and test tasks and their trials are the same for every seed of a run."""
+VIDEO = "rollouts.gif"
+"""The video's file in the run's folder."""
 
 
-def demos_of_split(env: envs.Env, config: Config, split: str) -> DemoSet:
-    """Returns the demonstrations of a split as a run uses them, planned or from the cache of earlier runs."""
-    num_tasks, num_demos = {
+def size_of_split(config: Config, split: str) -> tuple[int, int]:
+    """Returns the number of a split's tasks, and of each task's demonstrations.
+
+    Validation tasks have at least one demonstration to spare, on which `listening.measure` asks for actions.
+    """
+    return {
         "train": (config.data.tasks, config.data.demos_per_task),
         "validation": (config.evaluation.validation_tasks, config.evaluation.shots + max(config.data.spare_demos, 1)),
         "test": (config.evaluation.tasks, config.evaluation.shots + config.data.spare_demos),
     }[split]
+
+
+def demos_of_split(env: envs.Env, config: Config, split: str) -> DemoSet:
+    """Returns the demonstrations of a split as a run uses them, planned or from the cache of earlier runs."""
+    num_tasks, num_demos = size_of_split(config, split)
     seed = config.seed if split == "train" else EVALUATION_SEED
     folder = platform.cache_folder() / "demos"
     return demos_lib.cached(folder, env, seed, split, num_tasks, num_demos, config.data)
@@ -70,7 +82,7 @@ def training_on(env: envs.Env, config: Config, train: DemoSet) -> Training:
 def validation_of(
     env: envs.Env, method: Method, params: Params, demos: DemoSet, config: EvalConfig
 ) -> tuple[float, dict[str, float]]:
-    """Success in the trials of the validation tasks, and what `listening.measure` finds there."""
+    """Evaluates on the validation tasks: success in their trials, and what `listening.measure` finds there."""
     trials = closed_loop.run_trials(env, method, params, demos, config, trial_key("validation"))
     return float(trials.success.mean()), closed_loop.listen(env, method, params, demos, config.shots)
 
@@ -115,9 +127,10 @@ class SimulatedRun(Run):
 
     def demos(self, split: str) -> DemoSet:
         """Returns the demonstrations of a split, planned or from the cache of earlier runs."""
-        with self.clock("demos"), self.console.status(f"planning {split} demonstrations"):
+        count = math.prod(size_of_split(self.config, split))
+        with self.clock("demos"), self.phase(f"planning {split} demonstrations", count):
             demos = demos_of_split(self.env, self.config, split)
-        count, success = demos.success.size, float(demos.success.mean())
+        success = float(demos.success.mean())
         self._demonstrations[split] = {"count": count, "success": success}
         self.console.print(f"{count} {split} demonstrations, of which {success:.1%} succeed")
         return demos
@@ -131,6 +144,22 @@ class SimulatedRun(Run):
             f"(95% interval {low:.1%} to {high:.1%}; {baselines}). {result['wall_clock_s']['total']:.0f} s in all. "
             f"See {self.folder}"
         )
+
+    @property
+    def _files(self) -> dict[str, str]:
+        return super()._files | {
+            f"{self.folder}/{VIDEO}": "demonstrations on the left, the policy's trials on the right"
+        }
+
+    @property
+    def _next(self) -> dict[str, str]:
+        other = next(name for name in ("push", "reach") if name != self.config.env_name)
+        watch = {"darwin": "open", "win32": "start"}.get(sys.platform, "xdg-open")
+        return {
+            "look at the video": f"{watch} {self.folder}/{VIDEO}",
+            **super()._next,
+            "train another task": f"python -m milx.train --env={other}",
+        }
 
     @functools.cached_property
     def _validation(self) -> DemoSet:
@@ -156,14 +185,17 @@ class SimulatedRun(Run):
     def _judge(self, params: Params) -> tuple[dict[str, Any], Callable[[dict[str, Any]], None]]:
         config, test = self.config, self.demos("test")
         with self.clock("evaluate"):
-            key = trial_key("test")
-            baselines = closed_loop.evaluate_baselines(self.env, test, config.evaluation, config.data, key)
-            trials, found = result_of(self.env, self.method, params, test, config, baselines)
+            key, tasks = trial_key("test"), config.evaluation.tasks
+            with self.phase("evaluating the baselines", (1 + 2 * config.evaluation.baseline_trials) * tasks):
+                baselines = closed_loop.evaluate_baselines(self.env, test, config.evaluation, config.data, key)
+            with self.phase("evaluating the policy", 2 * tasks):
+                trials, found = result_of(self.env, self.method, params, test, config, baselines)
 
         def draw(result: dict[str, Any]) -> None:
             metrics = read_metrics(self.folder / "metrics.jsonl")
             plots.learning_curve(metrics, result, self.folder / "learning_curve.png")
-            self._film(test, trials)
+            with self.phase("drawing the video"):
+                self._film(test, trials)
 
         return found | {"demonstrations": self._demonstrations}, draw
 
@@ -174,4 +206,4 @@ class SimulatedRun(Run):
         camera = envs.make(self.config.env_name, (scale * height, scale * width))
         task, demo, trial = jax.tree.map(lambda x: x[:num_tasks], (test.task, test.states, trials.states))
         clips = [closed_loop.film(camera, task, jax.tree.map(lambda x: x[:, 0], states)) for states in (demo, trial)]
-        plots.side_by_side(np.asarray(clips[0]), np.asarray(clips[1]), self.folder / "rollouts.gif")
+        plots.side_by_side(np.asarray(clips[0]), np.asarray(clips[1]), self.folder / VIDEO)

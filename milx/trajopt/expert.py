@@ -131,7 +131,7 @@ def _perform_controlled(env: Env, noise: float, *batch: Any) -> tuple[State, jax
 
 @functools.partial(jax.jit, static_argnums=0)
 def judge(env: Env, task: Task, states: State) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """Success of a batch of episodes, and success by the environment's other criteria; all have a leading axis."""
+    """Judges a batch of episodes by success and by the environment's other criteria; all have a leading axis."""
 
     def one(task: Task, states: State) -> tuple[jax.Array, dict[str, jax.Array]]:
         return env.success(task, states), env.other_criteria(task, states)

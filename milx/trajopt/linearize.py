@@ -9,7 +9,7 @@ import jax
 def linearize(
     function: Callable[..., Any], states: jax.Array, actions: jax.Array, *per_step: jax.Array
 ) -> tuple[Any, Any]:
-    """Jacobians and values of `function(x, u, ...)` at every step of a trajectory.
+    """Computes Jacobians and values of `function(x, u, ...)` at every step of a trajectory.
 
     T is the number of steps, n the size of a state, m of an action. One pass pushes all n + m unit tangents through
     the function together. Forward mode is the only way through `mjx.step`, whose solver loops have no reverse mode.

@@ -138,6 +138,12 @@ def test_presets_name_fields_that_some_method_has(env, preset):
     assert set(PRESETS[env][preset]) <= known
 
 
+def test_a_preset_with_a_field_that_no_method_has_is_refused(monkeypatch):
+    monkeypatch.setitem(PRESETS, "mine", {"fast": {"train.stepz": 7}})
+    with pytest.raises(ValueError, match=r"config\.train\.stepz: no such field"):
+        make_config("mine", preset="fast")
+
+
 def test_a_name_is_registered_once():
     with pytest.raises(ValueError, match="method: 'lstm' is registered already, expected a name that is free"):
         registry.register_method("lstm", make=None)
@@ -148,7 +154,7 @@ SHIPPED = pathlib.Path(milx.__file__).parent / "deploy" / "weights"
 
 
 def test_configurations_of_all_results_and_shipped_policies_load():
-    """Files of all layouts, from before methods had settings of their own on."""
+    """Loads files of all layouts, from before methods had settings of their own on."""
     files, versions = [*RESULTS.rglob("*.json"), *SHIPPED.rglob("result.json")], set()
     configs = [content["config"] for content in map(_read, files) if isinstance(content, dict) and "config" in content]
     for values in configs:
@@ -167,6 +173,11 @@ def _read(path):
 
 def _as_json(value):
     return json.loads(json.dumps(value))
+
+
+def test_a_method_that_is_no_name_is_refused():
+    with pytest.raises(ValueError, match="method"):
+        assemble.from_dict({"method_name": [1]})
 
 
 def test_a_later_layout_is_refused():

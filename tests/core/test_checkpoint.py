@@ -21,7 +21,7 @@ def items(step):
 
 
 def written(folder, scores):
-    """Checkpoints of these scores, at steps 10, 20, ..."""
+    """Writes checkpoints of these scores, at steps 10, 20, ..."""
     checkpoints = Checkpoints(folder)
     for i, score in enumerate(scores):
         assert checkpoints.save(10 * (i + 1), items(10 * (i + 1)), score, {"number": i})

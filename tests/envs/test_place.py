@@ -145,7 +145,7 @@ def dropped(env):
     """Drops a thing of its split over the middle of every container, and returns where it comes to rest."""
     tasks, states = [], []
     for i, name in enumerate(CONTAINERS):
-        split = next(split for split, names in containers.SPLITS.items() if name in names)
+        split = next(split for split, names in containers.BY_SPLIT.items() if name in names)
         task = env.sample_task(jax.random.key(i), split)
         task = dataclasses.replace(task, container=task.container.at[task.target].set(i))
         tasks.append(task)
@@ -242,9 +242,9 @@ def test_scenes_keep_their_distances_and_redrawing_keeps_the_targets_place(env, 
 
 
 def test_containers_are_held_out_by_kind():
-    names = [name for split in containers.SPLITS.values() for name in split]
+    names = [name for split in containers.BY_SPLIT.values() for name in split]
     assert sorted(names) == sorted(CONTAINERS)
-    assert len(containers.SPLITS["test"]) == 18  # and 11 things: the paper's 29
+    assert len(containers.BY_SPLIT["test"]) == 18  # and 11 things: the paper's 29
 
 
 @pytest.mark.parametrize("name", CONTAINERS)

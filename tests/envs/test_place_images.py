@@ -26,7 +26,7 @@ def task(env):
 
 
 def test_the_image_is_that_of_the_tasks_own_model(env, task):
-    """Geoms, sizes and colors of things without a texture, from C MuJoCo's poses; what is not used is not seen."""
+    """Compares geoms, sizes and colors with C MuJoCo's poses; what is not used is not seen."""
     task = dataclasses.replace(task, texture=task.texture._replace(family=jnp.zeros(4, jnp.int32)))
     state = env.reset(jax.random.key(5), task)
     model, ours = copy.copy(env.mj_model), env.model_of(task)

@@ -16,7 +16,7 @@ from milx.data.goals import goals
 from milx.envs.base import State
 from milx.envs.push import env as push
 from milx.envs.push.env import NUM_JOINTS, Push
-from milx.envs.shapes import SHAPES, SPLITS
+from milx.envs.shapes import BY_SPLIT, SHAPES
 from milx.envs.shapes.primitives import NUM_CAPSULES, to_geoms
 from milx.render.scene import Renderer, to_uint8
 from milx.trajopt.expert import VERSION, perform
@@ -186,7 +186,7 @@ def test_the_hand_starts_low_enough_for_every_shape(env, task):
 
 
 def test_the_image_is_that_of_the_tasks_own_model(env, task):
-    """Geoms, sizes and colors of things without a texture; what is not used is not seen."""
+    """Compares geoms, sizes and colors of objects without a texture; what is not used is not seen."""
     task = dataclasses.replace(task, texture=task.texture._replace(family=jnp.zeros(2, jnp.int32)))
     model = c_model(env, task)
     model.geom_rgba[:] = env.colors(task)
@@ -228,7 +228,7 @@ def test_objects_start_on_either_side_away_from_the_goal_and_from_each_other(env
     assert abs(target.mean() - 0.5) < 4 * 0.5 / len(target) ** 0.5
     assert abs(np.corrcoef(target, place[:, 0, 1])[0, 1]) < 4 / len(target) ** 0.5
     names = np.array(list(SHAPES))[np.asarray(tasks.shape)]
-    assert set(names.ravel()) == set(SPLITS["test"])
+    assert set(names.ravel()) == set(BY_SPLIT["test"])
     assert (names[:, 0] != names[:, 1]).all()
 
 

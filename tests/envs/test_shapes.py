@@ -2,9 +2,13 @@
 
 import mujoco
 import numpy as np
+import planned
 import pytest
 
-from milx.envs.shapes import SHAPES, SPLITS
+from milx.envs.place import containers
+from milx.envs.place.env import Place
+from milx.envs.push.env import Push
+from milx.envs.shapes import BY_SPLIT, SHAPES
 from milx.envs.shapes.primitives import (
     NUM_CAPSULES,
     Box,
@@ -18,7 +22,7 @@ from milx.envs.shapes.primitives import (
 
 
 def outline(found):
-    """Ends [N, 2, 2] and radii [N] of the capsules, read back from positions, quaternions and sizes."""
+    """Reads ends [N, 2, 2] and radii [N] of the capsules back from positions, quaternions and sizes."""
     ends, radius = [], []
     for pos, quat, size in zip(found.pos[:NUM_CAPSULES], found.quat, found.size, strict=False):
         if pos[2] > 0:  # not used otherwise
@@ -81,8 +85,8 @@ def rim(primitive):
 
 
 def test_every_shape_is_in_one_split():
-    assert [len(SPLITS[split]) for split in ("train", "validation", "test")] == [105, 10, 11]
-    assert sorted(name for names in SPLITS.values() for name in names) == sorted(SHAPES)
+    assert [len(BY_SPLIT[split]) for split in ("train", "validation", "test")] == [105, 10, 11]
+    assert sorted(name for names in BY_SPLIT.values() for name in names) == sorted(SHAPES)
 
 
 def test_a_shape_that_does_not_fit_the_geoms_is_refused():
@@ -90,3 +94,17 @@ def test_a_shape_that_does_not_fit_the_geoms_is_refused():
         shape(*[Capsule(0, 0, 1, 0, 0.1)] * 5)
     with pytest.raises(ValueError, match="got no Capsule"):
         shape(Ellipsoid(0, 0, 1, 1, 1, 1))
+
+
+def test_the_catalogue_of_objects_is_what_the_versions_say():
+    """Compares every object's geoms, by one number each, and which split it is in: tasks refer to them by number."""
+    found = []
+    for catalogue, build, by_split in (
+        (SHAPES, to_geoms, BY_SPLIT),
+        (containers.CONTAINERS, containers.to_geoms, containers.BY_SPLIT),
+    ):
+        splits = {name: number for number, names in enumerate(by_split.values()) for name in names}
+        for name, entry in catalogue.items():
+            flat = np.concatenate([np.ravel(np.asarray(x, float)) for x in build(entry)])
+            found += [splits[name], flat @ np.cos(np.arange(flat.size))]
+    planned.check("objects", [Push.version, Place.version], np.array(found), atol=1e-6)

@@ -1,6 +1,7 @@
 """Whether a policy listens: errors and steps against loops over the tasks."""
 
 import dataclasses
+import re
 
 import jax
 import jax.numpy as jnp
@@ -8,6 +9,8 @@ import numpy as np
 import optax
 import pytest
 
+from milx.config import assemble
+from milx.config.assemble import make_config
 from milx.config.schema import TrainConfig
 from milx.evaluation import listening
 from milx.methods import Method
@@ -146,3 +149,10 @@ def test_progress_counts_the_updates_with_an_inner_step(batch):
         _, metrics = jax.jit(trainer._gradient)(params, batch, jnp.asarray(step))
         expected = method.loss(params, batch, progress)[1]["loss"]
         np.testing.assert_allclose(metrics["loss"], expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("has_inner_step", [True, False])
+def test_advice_names_fields_that_exist(has_inner_step):
+    named = re.findall(r"(?<![\w.])(?:method|train|network|optimizer|mil)\.\w+", listening.advice(has_inner_step))
+    assert len(named) >= 2
+    assert set(named) <= set(assemble.fields(make_config("reach", "mil" if has_inner_step else "lstm")))

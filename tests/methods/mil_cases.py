@@ -18,7 +18,7 @@ NO_CLIP = 1e9
 
 
 def random_demos(rng, *shape):
-    """Demonstrations with leading axes `shape`."""
+    """Samples demonstrations with leading axes `shape`."""
     return Demo(
         image=jnp.asarray(rng.integers(0, 256, (*shape, STEPS, *IMAGE_SHAPE, 3), dtype=np.uint8)),
         state=jnp.asarray(rng.standard_normal((*shape, STEPS, STATE))),

@@ -48,7 +48,7 @@ def build(name, vision, goal_head=False):
 
 
 def random_demos(rng, vision, *shape):
-    """Demonstrations with leading axes `shape`."""
+    """Samples demonstrations with leading axes `shape`."""
     image = rng.integers(0, 256, (*shape, STEPS, *IMAGE_SHAPE, 3), dtype=np.uint8) if vision else None
     state, action = (rng.standard_normal((*shape, STEPS, size)).astype(np.float32) for size in (STATE, ACTION))
     return jax.tree.map(jnp.asarray, Demo(image, state, action, goal=state[..., 1:3]))

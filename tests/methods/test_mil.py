@@ -118,7 +118,7 @@ def test_no_gradient_reaches_the_whitening_and_adam_leaves_it(batch):
 
 @pytest.fixture(scope="module")
 def constant_case(batch):
-    """Parameters, the batch without images, and the mean whitened actions of support and query [TASKS, A]."""
+    """Makes parameters, a batch without images, and the mean whitened actions of support and query [TASKS, A]."""
     whitening = random_whitening(np.random.default_rng(4))
     support, query = (dataclasses.replace(demo, image=None) for demo in (batch.support, batch.query))
     a, b = ((x.action.mean(axis=(1, 2)) - whitening.action_mean) / whitening.action_scale for x in (support, query))

@@ -86,7 +86,7 @@ def test_votes_are_affine_in_the_position_and_the_weights_follow_the_features(rn
 
 
 def test_hindsight_is_where_the_first_image_differs_from_the_last(rng):
-    """Filters that subtract one from the other find the one place that lost its features, whatever lies between."""
+    """Sets filters that subtract one image from the other: they find the place that lost its features."""
     units = HindsightHead.hidden
     seen = rng.uniform(size=(1, 3, HEIGHT, WIDTH, CHANNELS))
     seen[0, -1] = seen[0, 0]

@@ -20,7 +20,7 @@ def reference_conv2d(x, kernel, stride):
 
 @functools.partial(jax.jit, static_argnums=(0, 3))
 def derivatives(conv, inputs, directions, stride):
-    """Values, gradient and Hessian-vector product of a cubic function of a convolution of (x, kernel)."""
+    """Computes value, gradient and Hessian-vector product of a cubic function of a convolution of (x, kernel)."""
 
     def cubed(inputs):
         return jnp.sum(conv(*inputs, stride) ** 3)
@@ -49,7 +49,7 @@ def test_convolution_and_its_derivatives_are_those_of_lax(rng, convolve, shape, 
 
 
 def test_blocks_in_bfloat16_are_as_exact_as_their_products(rng):
-    """Products and sums of four of them are rounded to 8 bits: on average by less than one unit in the last place."""
+    """Bounds the mean error: products and sums of four of them are rounded to 8 bits."""
     x, kernel = (jnp.asarray(rng.standard_normal(shape)) for shape in ((4, 16, 20, 40), (3, 3, 40, 40)))
     x, kernel = (value.astype(jnp.bfloat16).astype(float) for value in (x, kernel))
     exact = layers.convolve_blocks(x, kernel, 2)

@@ -17,13 +17,13 @@ NAMES = list(textures.FAMILIES)
 
 
 def test_every_family_belongs_to_one_split():
-    assert sorted(sum(textures.SPLITS.values(), ())) == sorted(NAMES)
+    assert sorted(sum(textures.BY_SPLIT.values(), ())) == sorted(NAMES)
 
 
-@pytest.mark.parametrize("split", textures.SPLITS)
+@pytest.mark.parametrize("split", textures.BY_SPLIT)
 def test_frames_turn_evenly_and_scale_by_the_period(split):
     drawn = jax.vmap(lambda key: textures.draw(key, split))(jax.random.split(jax.random.key(0), 500))
-    assert {NAMES[i] for i in np.asarray(drawn.family)} == set(textures.SPLITS[split])
+    assert {NAMES[i] for i in np.asarray(drawn.family)} == set(textures.BY_SPLIT[split])
     linear = np.asarray(drawn.frame[..., :3], float)
     period = np.linalg.det(linear) ** (-1 / 3)
     assert textures.PERIOD[0] < period.min() < period.max() < textures.PERIOD[1]
@@ -84,7 +84,7 @@ def test_kernel_paints_the_textures_of_the_reference(seed):
 
 
 def test_a_texture_moves_with_the_whole_scene():
-    """Things, camera and textures turned and shifted together look the same."""
+    """Turns and shifts objects, camera and textures together: the image stays the same."""
     renderer, scene = textured(0)
     turn = jnp.asarray(Rotation.from_euler("xyz", [0.4, -0.7, 1.1]).as_matrix(), jnp.float32)
     shift = jnp.array([0.3, -0.2, 0.5])

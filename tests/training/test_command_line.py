@@ -34,6 +34,23 @@ def test_bad_input_ends_with_a_message_that_lists_what_is_valid(tmp_path, argume
     assert list(tmp_path.iterdir()) == [], "no run was begun"
 
 
+@pytest.mark.parametrize(
+    ("argument", "message"),
+    [
+        ("--config.recorded.horizon=7", "--config.recorded.horizon: expected only with --data"),
+        ("--env=recorded", "--env: got 'recorded', expected --data=FOLDER"),
+        (
+            "--num_processes=2",
+            "--coordinator, --num_processes and --process_id: got some of them, expected all or none",
+        ),
+    ],
+)
+def test_flags_that_do_not_belong_together_end_with_a_message(tmp_path, argument, message):
+    process = train(tmp_path, argument)
+    assert process.returncode != 0
+    assert message in process.stderr and "Traceback" not in process.stderr
+
+
 def test_a_method_has_no_settings_of_another(tmp_path):
     said = train(tmp_path, "--method=lstm", "--config.method.inner_steps=7").stderr
     assert "--config.method.inner_steps: no such field with --method=lstm, expected one of" in said
@@ -58,6 +75,11 @@ def test_a_package_of_ones_own_is_found(tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     said = train(tmp_path, "--env=my_env", "--method=my_method", "--config.train.nope=1").stderr
     assert "--config.train.nope: no such field with --method=my_method" in said
+
+    (tmp_path / "mine.py").write_text("import milx\nmilx.no_such_function()\n")
+    said = train(tmp_path, "--env=nope").stderr
+    assert "plugin mine = mine: AttributeError" in said, "a broken package is named"
+    assert "env: got 'nope'" in said, "and milx goes on without it"
 
 
 def test_value_of_another_type_ends_with_a_message(tmp_path):

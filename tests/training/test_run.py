@@ -29,7 +29,7 @@ RESULT_FIELDS = {
 
 
 def final_items(run):
-    """Parameters and optimizer of the newest checkpoint, and its step."""
+    """Restores parameters and optimizer of the newest checkpoint, and its step."""
     checkpoints = Checkpoints(run.folder / "checkpoints", read_only=True)
     params = params_like(run.method, run.env.spec)
     step = jax.ShapeDtypeStruct((), np.int32)
@@ -39,7 +39,7 @@ def final_items(run):
 
 
 def untimed(lines):
-    """Metrics without the one that a clock measures."""
+    """Leaves out the metric that a clock measures."""
     return [{name: value for name, value in line.items() if name != "steps_per_s"} for line in lines]
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from milx.trajopt import boxqp, ilqr
+from milx.trajopt import ilqr
 
 SEEDS = 5
 
@@ -156,21 +156,6 @@ def test_limited_lq_reaches_the_convex_optimum(lqs, stacked_lqs):
         np.testing.assert_allclose(plans.actions[i], actions, atol=1e-4)
         # No feedback where a limit holds the action back, feedback elsewhere.
         np.testing.assert_array_equal(np.any(plans.gains[i] != 0, axis=-1), ~held)
-
-
-@pytest.mark.parametrize("m", [1, 2, 7])
-def test_box_qp_reaches_the_optimum(m):
-    rng = np.random.default_rng(m)
-    L = np.tril(rng.standard_normal((50, m, m))) + 2 * np.eye(m)
-    H, g = L @ L.transpose(0, 2, 1), 5 * rng.standard_normal((50, m))
-    low, high = -rng.uniform(0, 1, (50, m)), rng.uniform(0, 1, (50, m))
-    solve = jax.jit(jax.vmap(functools.partial(boxqp.solve, iterations=20)))
-    found, free = solve(H, g, low, high, np.zeros_like(g))
-    for i in range(50):
-        # ½ xᵀHx + gᵀx is ½ |Lᵀx + L⁻¹g|² up to a constant.
-        best = scipy.optimize.lsq_linear(L[i].T, -np.linalg.solve(L[i], g[i]), (low[i], high[i]), method="bvls")
-        np.testing.assert_allclose(found[i], best.x, atol=1e-7)
-        np.testing.assert_array_equal(free[i], best.active_mask == 0)
 
 
 # The swing-up of a pendulum: nonlinear, with limits too weak to lift it at once.

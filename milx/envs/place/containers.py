@@ -112,7 +112,7 @@ CONTAINERS: dict[str, Container] = {
 """All containers by name. A line adds one."""
 
 _NAMES = tuple(CONTAINERS)
-SPLITS: dict[str, tuple[str, ...]] = {
+BY_SPLIT: dict[str, tuple[str, ...]] = {
     "train": _NAMES[: _NAMES.index("wok")],
     "validation": _NAMES[_NAMES.index("wok") : _NAMES.index("mug")],
     "test": _NAMES[_NAMES.index("mug") :],
@@ -169,7 +169,7 @@ def to_geoms(container: Container) -> Geoms:
 
 
 def _walls(container: Container) -> list[tuple]:
-    """Boxes on the sides of the polygon, leaning so that they meet its bottom and its rim; x is along each."""
+    """Places boxes on the sides of the polygon, leaning so that they meet its bottom and its rim; x is along each."""
     rows, angle = [], 2 * np.pi * (np.arange(container.sides + 1) + 0.5) / container.sides
     corner = np.stack([np.cos(angle), np.sin(angle)], axis=1) / np.cos(np.pi / container.sides)
     corner[:, 0] *= container.length
@@ -190,7 +190,7 @@ def _walls(container: Container) -> list[tuple]:
 
 
 def _handles(container: Container) -> list[tuple]:
-    """Capsules that lie along x."""
+    """Places capsules that lie along x."""
     radius, lying = 0.06, (0.5**0.5, 0.0, 0.5**0.5, 0.0)
     reach = container.length + container.handle / 2
     height = max(container.handle_height * container.height, radius)

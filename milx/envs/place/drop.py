@@ -14,6 +14,7 @@ import numpy as np
 from jax.scipy.spatial.transform import Rotation
 
 from milx.core.mjx import mjx
+from milx.envs.base import OUT_OF_THE_WAY
 from milx.envs.place import containers
 from milx.envs.shapes.primitives import NUM_CAPSULES, Geoms
 
@@ -25,7 +26,6 @@ STILL = 0.05
 """What moves more slowly than this lies still (m/s)."""
 ROLLING = 2e-4
 """Damping of the thing's turning (N m s/rad), in place of rolling friction."""
-_OUT_OF_THE_WAY = (0.0, 0.0, -10.0)
 _GRAIN = 1e-3
 _XML = f"""
 <mujoco>
@@ -75,7 +75,7 @@ class Drop:
             width: half the container's width (m).
             place: [3] where the container stands (m).
         """
-        away, model = jnp.array(_OUT_OF_THE_WAY), self._model
+        away, model = jnp.array(OUT_OF_THE_WAY), self._model
         capsules, walls = slice(NUM_CAPSULES), slice(containers.WALLS)
         middle = jnp.array([0.0, 0.0, 1.0]) * _middle(thing)
         # A capsule that a shape does not use is a grain within the first one: it falls with the thing.

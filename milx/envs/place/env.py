@@ -13,7 +13,7 @@ from jax.scipy.spatial.transform import Rotation
 from milx.core.linear_algebra import solve_free
 from milx.core.mjx import mjx
 from milx.envs import shapes
-from milx.envs.base import ASSETS, Env, State, check_split
+from milx.envs.base import ASSETS, OUT_OF_THE_WAY, Env, State, check_split
 from milx.envs.place import containers, drop
 from milx.envs.place.containers import CONTAINERS
 from milx.envs.place.drop import Fall
@@ -43,7 +43,6 @@ OFF_COST, TURN_COST = 5.0, 0.5
 """Weights of the residuals: 1/m, and of unit vectors, which have no unit."""
 _START = (0.0, -1.167, 0.0, 1.926, 0.0, 0.811, 0.0)
 _DAMPING = 0.05
-_OUT_OF_THE_WAY = (0.0, 0.0, -10.0)
 _CANDIDATES = 64
 
 
@@ -128,11 +127,11 @@ class Place(Env[PlaceTask]):
         check_split(split)
         keys = jax.random.split(key, 6)
         indices = lambda names, chosen: jnp.array([list(names).index(name) for name in chosen])  # noqa: E731
-        kinds = indices(CONTAINERS, containers.SPLITS[split])
+        kinds = indices(CONTAINERS, containers.BY_SPLIT[split])
         low, high = CONTAINER_SIZE
         return PlaceTask(
             target=jax.random.randint(keys[0], (), 0, NUM_CONTAINERS),
-            thing=jax.random.choice(keys[1], indices(SHAPES, shapes.SPLITS[split])),
+            thing=jax.random.choice(keys[1], indices(SHAPES, shapes.BY_SPLIT[split])),
             thing_size=jax.random.uniform(keys[2], minval=THING_SIZE[0], maxval=THING_SIZE[1]),
             container=jax.random.choice(keys[3], kinds, (NUM_CONTAINERS,), replace=False),
             container_size=jax.random.uniform(keys[4], (NUM_CONTAINERS,), minval=low, maxval=high),
@@ -182,7 +181,7 @@ class Place(Env[PlaceTask]):
         model = self.model
         pos, quat, size = model.geom_pos, model.geom_quat, model.geom_size
         for geoms, (one, unit) in zip(self._geom, self._geoms_of(task), strict=True):
-            pos = pos.at[geoms].set(jnp.where(one.used[:, None], unit * one.pos, jnp.array(_OUT_OF_THE_WAY)))
+            pos = pos.at[geoms].set(jnp.where(one.used[:, None], unit * one.pos, jnp.array(OUT_OF_THE_WAY)))
             quat, size = quat.at[geoms].set(one.quat), size.at[geoms].set(unit * one.size)
         return model.replace(geom_pos=pos, geom_quat=quat, geom_size=size)
 
@@ -292,7 +291,7 @@ def _top(geoms: primitives.Geoms) -> float:
 
 
 def _draw_looks(key: jax.Array, split: str) -> dict[str, Any]:
-    """Colors and textures of the thing and of the containers."""
+    """Samples colors and textures of the thing and of the containers."""
     count = 1 + NUM_CONTAINERS
     color_key, texture_key = jax.random.split(key)
     texture = jax.vmap(functools.partial(textures.draw, split=split))(jax.random.split(texture_key, count))

@@ -42,7 +42,7 @@ def torque(
     aside: jax.Array,
     friction: jax.Array,
 ) -> jax.Array:
-    """Torques of the joints [7] (N m) for one time step.
+    """Computes the torques of the joints [7] (N m) for one time step.
 
     Args:
         pose: [9] tip position (m), unit vectors in which the hand pushes and in which its prongs point.

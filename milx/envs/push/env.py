@@ -10,9 +10,9 @@ import mujoco
 import numpy as np
 
 from milx.core.mjx import mjx
-from milx.envs.base import ASSETS, Env, State, check_split
+from milx.envs.base import ASSETS, OUT_OF_THE_WAY, Env, State, check_split
 from milx.envs.push import controller
-from milx.envs.shapes import SHAPES, SPLITS
+from milx.envs.shapes import BY_SPLIT, SHAPES
 from milx.envs.shapes.primitives import NUM_CAPSULES, SLOTS, Geoms, to_geoms
 from milx.render import textures
 from milx.render.textures import Textures
@@ -39,7 +39,6 @@ BEHIND = 1.25
 """The hand comes down about so many times as far from the goal's center as the object is."""
 NUM_JOINTS = 7
 _START = (0.0, -0.895, 0.0, 2.397, 0.0, 0.069, 0.0)
-_OUT_OF_THE_WAY = (0.0, 0.0, -10.0)
 OBJECT_COST, TIP_COST, FINAL_COST = 1.0, 0.5, 10.0
 """Weights of the residuals (1/m)."""
 _OBJECTS = ("object_0", "object_1")
@@ -111,7 +110,7 @@ class Push(Env[PushTask]):
         """
         check_split(split)
         names = list(SHAPES)
-        indices = jnp.array([names.index(name) for name in SPLITS[split]])
+        indices = jnp.array([names.index(name) for name in BY_SPLIT[split]])
         shape_key, target_key, size_key, mass_key, damping_key, look_key = jax.random.split(key, 6)
         draw = lambda key, limits: jax.random.uniform(key, (2,), minval=limits[0], maxval=limits[1])  # noqa: E731
         return PushTask(
@@ -164,7 +163,7 @@ class Push(Env[PushTask]):
         lever = shapes.squared_gyration * task.size**2
         inertia = task.mass * lever
         inverse = jnp.stack([2 / task.mass, 1 / inertia], axis=-1) / 3  # of two slides and one hinge, over three axes
-        pos = jnp.where(shapes.used[..., None], unit * shapes.pos, jnp.array(_OUT_OF_THE_WAY))
+        pos = jnp.where(shapes.used[..., None], unit * shapes.pos, jnp.array(OUT_OF_THE_WAY))
         return model.replace(
             geom_pos=model.geom_pos.at[geoms].set(pos),
             geom_quat=model.geom_quat.at[geoms].set(shapes.quat),
@@ -212,7 +211,7 @@ class Push(Env[PushTask]):
         return textures.on_geoms(task.texture, self._body, self.mj_model.geom_bodyid, data.xpos, data.xmat)
 
     def guess(self, task: PushTask, state: State) -> jax.Array:
-        """Returns [T, 7], what `push_controller` does from here."""
+        """Returns [T, 7], what `controller.torque` does from here."""
         tactic = jnp.asarray(self.tactics[0])
 
         def step(state: State, _: None) -> tuple[State, jax.Array]:
@@ -222,7 +221,7 @@ class Push(Env[PushTask]):
         return jax.lax.scan(step, state, length=self.horizon)[1]
 
     def control(self, task: PushTask, state: State, tactic: jax.Array) -> jax.Array:
-        """Returns [7], what `push_controller` does in one state, `tactic` (m) to the side of the object's center."""
+        """Returns [7], what `controller.torque` does in one state, `tactic` (m) to the side of the object's center."""
         target = task.target
         x, y, turn = self.objects(state)[target]
         pose, jacobian = self.hand(state.qpos), jax.jacfwd(self.hand)(state.qpos)[:, :NUM_JOINTS]
@@ -269,7 +268,7 @@ class Push(Env[PushTask]):
 
 
 def _draw_looks(key: jax.Array, split: str) -> dict[str, Any]:
-    """Colors and textures of two objects."""
+    """Samples colors and textures of two objects."""
     color_key, texture_key = jax.random.split(key)
     texture = jax.vmap(functools.partial(textures.draw, split=split))(jax.random.split(texture_key))
     return {"color": jax.random.uniform(color_key, (2, 3)), "texture": texture}

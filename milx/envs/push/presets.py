@@ -74,20 +74,3 @@ _CPU = _FAST | {
 }
 
 PUSH: dict[str, Overrides] = {"paper": _PAPER, "fast": _FAST, "cpu": _CPU}
-
-_RECORDED_FAST = _FAST | {"train.steps": 10_000, "train.eval_every": 1000, "train.redraw": False}
-RECORDED: dict[str, Overrides] = {
-    "fast": _RECORDED_FAST,
-    "cpu": _RECORDED_FAST
-    | {
-        "network.filters": (16, 16, 16, 16),
-        "network.kernel": 3,
-        "network.strides": (2, 2, 2, 1),
-        "network.fc_layers": (100, 100, 100),
-        "network.mixed_precision": False,
-        "train.steps": 2000,
-        "train.meta_batch": 4,
-        "train.log_every": 50,
-        "train.eval_every": 500,
-    },
-}

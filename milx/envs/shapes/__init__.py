@@ -16,7 +16,7 @@ TEST = (
     *("umbrella", "banana", "teapot", "helicopter", "spanner"),
 )
 VALIDATION = ("letter_y", "trident", "lamp", "hedgehog", "octopus", "axe", "ladle", "sofa", "pear", "tractor")
-SPLITS: dict[str, tuple[str, ...]] = {
+BY_SPLIT: dict[str, tuple[str, ...]] = {
     "train": tuple(name for name in SHAPES if name not in TEST + VALIDATION),
     "validation": VALIDATION,
     "test": TEST,

@@ -102,7 +102,7 @@ def ball(x: float, y: float, radius: float) -> Capsule:
 
 
 def strokes(text: str, radius: float = 0.22) -> Shape:
-    """Capsules between points "x,y", as in "-1,-1 0,1 1,-1" for a roof; "|" lifts the pen."""
+    """Draws capsules between points "x,y", as in "-1,-1 0,1 1,-1" for a roof; "|" lifts the pen."""
     capsules = []
     for line in text.split("|"):
         points = [[float(v) for v in point.split(",")] for point in line.split()]
@@ -189,7 +189,7 @@ def _to_geom(p: Capsule | Ellipsoid | Box | Cylinder) -> tuple[list[float], list
 
 
 def _ends(capsules: tuple[Capsule, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Ends [N, 2, 2] and radii [N] of N capsules."""
+    """Returns ends [N, 2, 2] and radii [N] of N capsules."""
     ends = np.array([[[c.x0, c.y0], [c.x1, c.y1]] for c in capsules], float)
     return ends, np.array([c.radius for c in capsules])
 

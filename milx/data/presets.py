@@ -1,0 +1,21 @@
+"""Presets of recorded demonstrations: those of push, whose images are the largest, with fewer updates."""
+
+from milx.config.registry import Overrides
+from milx.envs.push.presets import PUSH
+
+_FAST = PUSH["fast"] | {"train.steps": 10_000, "train.eval_every": 1000, "train.redraw": False}
+PRESETS: dict[str, Overrides] = {
+    "fast": _FAST,
+    "cpu": _FAST
+    | {
+        "network.filters": (16, 16, 16, 16),
+        "network.kernel": 3,
+        "network.strides": (2, 2, 2, 1),
+        "network.fc_layers": (100, 100, 100),
+        "network.mixed_precision": False,
+        "train.steps": 2000,
+        "train.meta_batch": 4,
+        "train.log_every": 50,
+        "train.eval_every": 500,
+    },
+}
