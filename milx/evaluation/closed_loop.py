@@ -98,6 +98,7 @@ def run_trials(
     config: EvalConfig,
     key: jax.Array,
     misled: bool = False,
+    first: int | None = None,
 ) -> Trials:
     """Runs every trial of every task in `demos`.
 
@@ -109,22 +110,24 @@ def run_trials(
         config: trials, shots and batch.
         key: draws the trial scenes.
         misled: show each task's policy the next task's demonstrations instead, and judge it by its own task.
+        first: number of trials of each task to run, the first ones; None for all.
     """
     scene_key, act_key = jax.random.split(key)
     scene = trial_scenes(env, demos.task, scene_key, config.trials)
     shown = jax.tree.map(lambda x: jnp.roll(x, -1, axis=0), demos) if misled else demos
     support = jax.tree.map(lambda x: x[:, : config.shots], (shown.states, shown.action))
     keys = jax.random.split(act_key, (demos.num_tasks, config.trials))
+    scene, keys = jax.tree.map(lambda x: x[:, :first], (scene, keys))
     inputs = (demos.task, shown.task, *support, scene, keys)
     return map_in_chunks(functools.partial(_run_batch, env, method, params), inputs, config.batch)
 
 
-def precompile(env: Env, method: Method, params: Params, config: EvalConfig) -> None:
+def precompile(env: Env, method: Method, params: Params, config: EvalConfig, first: int | None = None) -> None:
     """Compiles what `run_trials` runs, into the compilation cache; `params` may be shapes."""
-    size = parallel.round_up(config.batch)
+    size, trials = parallel.round_up(config.batch), min(config.trials, first or config.trials)
     batch = shapes(env, size, config.shots)
-    keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), (size, config.trials)))
-    scene = jax.eval_shape(lambda task: trial_scenes(env, task, jax.random.key(0), config.trials), batch.task)
+    keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), (size, trials)))
+    scene = jax.eval_shape(lambda task: trial_scenes(env, task, jax.random.key(0), trials), batch.task)
     shown = batch.task, batch.states, batch.action
     _run_batch.lower(env, method, params, batch.task, *shown, scene, keys).compile()
 
@@ -188,12 +191,12 @@ def evaluate_baselines(env: Env, demos: DemoSet, config: EvalConfig, expert: Dat
     states, _ = map_in_chunks(plan, tuple(twice), expert.plan_batch)
     as_it_is = jax.tree.map(lambda x: jnp.concatenate([x, x]), task)
     success, other = map_in_chunks(functools.partial(judge, env), (as_it_is, states), expert.plan_batch)
-    random = run_trials(env, Random(env.action_size), {}, demos, config, key)
+    random = run_trials(env, Random(env.action_size), {}, demos, config, key, first=num_trials)
 
     def rates(of_experts: jax.Array, of_random: jax.Array) -> dict[str, float]:
         halves = of_experts.reshape(2, total).mean(axis=1)
         return {
-            "random": float(of_random[:, :num_trials].mean()),
+            "random": float(of_random.mean()),
             "task_blind": float(halves[0]),
             "expert": float(halves[1]),
         }

@@ -176,7 +176,7 @@ class SimulatedRun(Run):
         env, config, random = self.env, self.config.evaluation, Random(self.env.action_size)
         return [
             lambda: closed_loop.precompile(env, self.method, params, config),
-            lambda: closed_loop.precompile(env, random, {}, config),
+            lambda: closed_loop.precompile(env, random, {}, config, config.baseline_trials),
         ]
 
     def _validate(self, params: Params) -> tuple[float, dict[str, float]]:

@@ -131,6 +131,8 @@ def test_no_trial_takes_place_in_the_demonstration_s_scene(trained, split, monke
     between = np.abs(flat[:, None] - flat).max(axis=-1) + np.eye(30)
     assert between.min() > 0.01, "no two trials share a scene"
     np.testing.assert_array_equal(scene.qpos, 0)
+    some, *_ = closed_loop.run_trials(trained.run.env, trained.run.method, (), demos, config, key, first=4)
+    jax.tree.map(np.testing.assert_array_equal, some, jax.tree.map(lambda x: x[:, :4], scene))
 
 
 @pytest.mark.parametrize(("trials", "asked", "tried"), [(3, 1, 1), (2, 2, 2), (2, 10, 2)])
