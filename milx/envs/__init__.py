@@ -3,18 +3,18 @@
 from milx.config.registry import ENVS, register_env
 from milx.envs.base import Env, State, Task
 from milx.envs.place.env import Place
-from milx.envs.place.presets import PLACE
+from milx.envs.place.presets import PLACE, PLACE_DURATIONS
 from milx.envs.push.env import Push
-from milx.envs.push.presets import PUSH
+from milx.envs.push.presets import PUSH, PUSH_DURATIONS
 from milx.envs.reach.env import Reach, ReachState
-from milx.envs.reach.presets import REACH, REACH_STATE
+from milx.envs.reach.presets import REACH, REACH_DURATIONS, REACH_STATE
 
 __all__ = ["ENVS", "Env", "State", "Task", "make"]
 
-register_env(Reach, REACH)
+register_env(Reach, REACH, REACH_DURATIONS)
 register_env(ReachState, REACH_STATE)
-register_env(Push, PUSH)
-register_env(Place, PLACE)
+register_env(Push, PUSH, PUSH_DURATIONS)
+register_env(Place, PLACE, PLACE_DURATIONS)
 
 
 def make(name: str, image_shape: tuple[int, int] | None = None, action_cost: float | None = None) -> Env:

@@ -51,6 +51,17 @@ def test_flags_that_do_not_belong_together_end_with_a_message(tmp_path, argument
     assert message in process.stderr and "Traceback" not in process.stderr
 
 
+def test_the_first_line_says_what_is_done_and_how_long_it_took(tmp_path):
+    (tmp_path / "run").write_text("a file, so that no run begins")
+    said = train(tmp_path, "--env=reach", "--preset=cpu", "--seed=3", "--workdir=run").stdout.splitlines()[0]
+    assert re.match(
+        r"milx: mil on reach, preset cpu, seed 3, with \d+ CPU cores, in run\. This took [\d.]+ minutes on", said
+    )
+    said = train(tmp_path, "--method=lstm", "--workdir=run").stdout
+    assert said.startswith("milx: lstm on reach, preset cpu, seed 0") and "--preset=paper, --preset=fast" in said
+    assert "This took" not in said, "that was measured for MIL"
+
+
 def test_a_method_has_no_settings_of_another(tmp_path):
     said = train(tmp_path, "--method=lstm", "--config.method.inner_steps=7").stderr
     assert "--config.method.inner_steps: no such field with --method=lstm, expected one of" in said
