@@ -68,6 +68,7 @@ class _Bars:
         columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TextColumn("{task.fields[text]}")
         self._bars = Progress(*columns, console=console, transient=True)
         self._tasks: list[TaskID] = []
+        self.phases: list[Phase] = []
 
     def start(self) -> None:
         self._bars.start()
@@ -77,12 +78,15 @@ class _Bars:
 
     def push(self, phase: Phase) -> None:
         self._tasks.append(self._bars.add_task(phase.description, total=None, text=""))
-        self.update(phase)
+        self.phases.append(phase)
+        self.update()
 
     def pop(self) -> None:
         self._bars.remove_task(self._tasks.pop())
+        self.phases.pop()
 
-    def update(self, phase: Phase) -> None:
+    def update(self) -> None:
+        phase = self.phases[-1]
         total = None if phase.fraction is None else 1.0
         self._bars.update(self._tasks[-1], total=total, completed=phase.fraction or 0.0, text=str(phase))
 
@@ -91,7 +95,8 @@ class _Lines:
     """A line about the innermost phase every INTERVAL seconds."""
 
     def __init__(self, console: Console):
-        self._console, self._phases, self._end = console, list[Phase](), threading.Event()
+        self._console, self._end = console, threading.Event()
+        self.phases: list[Phase] = []
         self._thread = threading.Thread(target=self._print, daemon=True)
 
     def start(self) -> None:
@@ -102,23 +107,22 @@ class _Lines:
         self._thread.join()
 
     def push(self, phase: Phase) -> None:
-        self._phases.append(phase)
+        self.phases.append(phase)
 
     def pop(self) -> None:
-        self._phases.pop()
+        self.phases.pop()
 
-    def update(self, phase: Phase) -> None:
+    def update(self) -> None:
         """Prints nothing: the thread reads the phase."""
 
     def _print(self) -> None:
         while not self._end.wait(INTERVAL):
-            for phase in self._phases[-1:]:
+            for phase in self.phases[-1:]:
                 text = ", ".join(filter(None, (f"{phase.seconds:.0f} s", str(phase))))
                 self._console.print(f"{phase.description}: {text}", highlight=False, markup=False)
 
 
-_Shown = tuple[_Bars | _Lines, list[Phase]]
-_display: contextvars.ContextVar[_Shown | None] = contextvars.ContextVar("display", default=None)
+_display: contextvars.ContextVar[_Bars | _Lines | None] = contextvars.ContextVar("display", default=None)
 
 
 @contextlib.contextmanager
@@ -132,18 +136,16 @@ def phase(console: Console, description: str, total: int | None = None, done: in
         done: number of items that were done before.
     """
     outer = _display.get()
-    display, phases = outer or (_Bars(console) if console.is_terminal or console.is_jupyter else _Lines(console), [])
-    token = _display.set((display, phases))
+    display = outer or (_Bars(console) if console.is_terminal or console.is_jupyter else _Lines(console))
+    if outer is None:
+        display.start()
+    display.push(Phase(description, total, done))
+    token = _display.set(display)
     try:
-        if outer is None:
-            display.start()
-        phases.append(Phase(description, total, done))
-        display.push(phases[-1])
         yield
     finally:
-        display.pop()
-        phases.pop()
         _display.reset(token)
+        display.pop()
         if outer is None:
             display.stop()
 
@@ -155,8 +157,7 @@ def advance(count: int, note: str = "") -> None:
         count: how many.
         note: what else to show of them; the last note stays.
     """
-    shown = _display.get()
-    if shown is not None:
-        display, phases = shown
-        phases[-1].advance(count, note)
-        display.update(phases[-1])
+    display = _display.get()
+    if display is not None:
+        display.phases[-1].advance(count, note)
+        display.update()
