@@ -15,12 +15,12 @@ FOLDER = pathlib.Path(__file__).parents[1] / "results" / "benchmarks"
 
 
 def number(row: dict) -> str:
-    """Prints the median of a row, or that there is none."""
+    """Formats the median of a row, or says that there is none."""
     return f"not run ({row['note']})" if row["median"] is None else f"{row['median']:,.4g} {row['unit']}".strip()
 
 
 def table(results: list[dict]) -> str:
-    """Prints all rows of all files."""
+    """Formats all rows of all files."""
     lines = ["| benchmark | what | median | memory | on | commit |", "|---|---|---|---|---|---|"]
     for result in results:
         for row in result["rows"]:

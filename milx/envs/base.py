@@ -140,7 +140,7 @@ class Env(abc.ABC, Generic[TaskT]):
         return None
 
     def image_to_plane(self, low: tuple[float, float], high: tuple[float, float], height: float) -> np.ndarray:
-        """Returns [3, 2], from (x, y, 1) to the x and y (m) of what is seen there between `low` and `high`.
+        """Returns [3, 2], from (x, y, 1) to the x and y (m) seen there at this height, between `low` and `high`.
 
         Exact for a camera that looks straight down, else the least squares over that part of the plane.
         """
@@ -181,7 +181,7 @@ class Env(abc.ABC, Generic[TaskT]):
 
     @abc.abstractmethod
     def robot_state(self, state: State) -> jax.Array:
-        """Returns [S], what the robot knows of itself and, where there is no image, of the objects (units below)."""
+        """Returns [S], what the robot knows of itself and, without an image, of the objects (units in the subclass)."""
 
     @abc.abstractmethod
     def colors(self, task: TaskT) -> jax.Array:

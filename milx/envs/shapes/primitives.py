@@ -195,7 +195,7 @@ def _ends(capsules: tuple[Capsule, ...]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _outline(capsules: tuple[Capsule, ...]) -> tuple[np.ndarray, float, float]:
-    """Returns the center [2] of the area of the capsules, its mean squared distance from there, and the unit."""
+    """Returns the center [2] of the capsules' area, its mean squared distance from there, and the unit of length."""
     ends, radius = _ends(capsules)
     low, high = (ends.min(axis=(0, 1)) - radius.max(), ends.max(axis=(0, 1)) + radius.max())
     grid = np.stack(np.meshgrid(*(np.arange(a, b, _SPACING) for a, b in zip(low, high, strict=True))), axis=-1)
