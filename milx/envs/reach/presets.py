@@ -48,7 +48,7 @@ _CPU = _FAST | {
 
 REACH: dict[str, Overrides] = {"paper": _PAPER, "fast": _FAST, "cpu": _CPU}
 REACH_DURATIONS = {
-    "paper": "10 minutes on an H200 that another run used, too",
+    "paper": "9 to 12 minutes on an H200 that another run used, too",
     "fast": "4.5 minutes on an H200",
     "cpu": "10 minutes on two CPU cores",
 }
