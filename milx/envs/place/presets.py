@@ -18,7 +18,7 @@ _PAPER = (
     CONDITIONED
     | _WORLD
     | {
-        "data.tasks": 600,
+        "data.tasks": 3000,
         "data.demos_per_task": 2,
         "network.filters": (64, 64, 64, 64, 64),
         "network.strides": (2, 2, 2, 1, 1),
