@@ -92,7 +92,8 @@ def result_of(
 ) -> tuple[Trials, dict[str, Any]]:
     """Evaluates on the test tasks: the trials, and what the result file says of them."""
     trials = closed_loop.run_trials(env, method, params, demos, config.evaluation, trial_key("test"))
-    misled = closed_loop.run_trials(env, method, params, demos, config.evaluation, trial_key("test"), misled=True)
+    first = config.evaluation.baseline_trials
+    misled = closed_loop.run_trials(env, method, params, demos, config.evaluation, trial_key("test"), True, first)
     return trials, closed_loop.summarize(env, config, demos.task, trials, misled, baselines)
 
 
@@ -173,10 +174,12 @@ class SimulatedRun(Run):
         return demos_lib.shapes(self.env, self.config.data.tasks, self.config.data.demos_per_task)
 
     def _precompile(self, params: Params) -> list[Callable[[], None]]:
-        env, config, random = self.env, self.config.evaluation, Random(self.env.action_size)
+        config, random = self.config.evaluation, Random(self.env.action_size)
+        precompile = functools.partial(closed_loop.precompile, self.env)
+        fewer = [config.baseline_trials] if config.baseline_trials < config.trials else []
         return [
-            lambda: closed_loop.precompile(env, self.method, params, config),
-            lambda: closed_loop.precompile(env, random, {}, config, config.baseline_trials),
+            *(functools.partial(precompile, self.method, params, config, first) for first in (None, *fewer)),
+            functools.partial(precompile, random, {}, config, config.baseline_trials),
         ]
 
     def _validate(self, params: Params) -> tuple[float, dict[str, float]]:
