@@ -135,17 +135,24 @@ class MethodConfig:
     given: str = GIVEN[0]
 
 
+OPTIMIZERS = ("adam", "muon")
+
+
 @dataclasses.dataclass
 class OptimizerConfig:
-    """Adam on the meta-objective.
+    """The optimizer of the meta-objective.
 
     Attributes:
+        name: one of OPTIMIZERS. "adam" (Kingma and Ba 2015) is the published one. "muon" (Jordan et al. 2024) replaces
+            the moving average of a kernel's gradient by an orthogonal matrix near it, of root mean square 1; the other
+            parameters have Adam with Nesterov's momentum (Dozat 2016).
         learning_rate: the maximum learning rate.
         warmup: fraction of the meta-updates in which the learning rate rises linearly from zero.
         cosine: let the learning rate decay to zero along a cosine over the rest of the run; otherwise it is constant.
         clip_norm: bound on the global norm of the meta-gradient; None for no bound.
     """
 
+    name: str = OPTIMIZERS[0]
     learning_rate: float = number(1e-3, 0)
     warmup: float = number(0.0, 0, 1)
     cosine: bool = False
@@ -186,7 +193,8 @@ class EvalConfig:
         validation_tasks: held-out tasks for selecting the best checkpoint.
         tasks: held-out tasks for the reported result (test tasks).
         trials: scenes in which each task is tried.
-        baseline_trials: number of these scenes in which the experts and random actions are tried, too.
+        baseline_trials: number of these scenes in which the experts, random actions, and the policy with another task's
+            demonstration are tried, too.
         shots: demonstrations that the policy adapts to.
         batch: tasks rolled out at once.
     """

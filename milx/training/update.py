@@ -1,7 +1,8 @@
 """Meta-training: everything between two log lines is one scan on the device.
 
-Sampling, rendering, inner step, meta-gradient and Adam all happen inside the scan. Batches are functions of the seed
-and the step, so a run that is stopped and started again repeats the uninterrupted run from its last checkpoint.
+Sampling, rendering, inner step, meta-gradient and the optimizer's step all happen inside the scan. Batches are
+functions of the seed and the step, so a run that is stopped and started again repeats the uninterrupted run from its
+last checkpoint.
 """
 
 import dataclasses
@@ -12,8 +13,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import optax
+import optax.contrib
 
-from milx.config.schema import OptimizerConfig, TrainConfig
+from milx.config.schema import OPTIMIZERS, OptimizerConfig, TrainConfig
 from milx.core import parallel
 from milx.core.batching import map_in_groups
 from milx.evaluation import listening
@@ -45,12 +47,32 @@ class TrainState:
 
 
 def make_optimizer(config: OptimizerConfig, steps: int) -> optax.GradientTransformation:
-    """Makes Adam with the configured schedule over `steps` meta-updates, after clipping the global norm."""
+    """Makes the optimizer with its schedule over `steps` meta-updates, after clipping the global norm.
+
+    Raises:
+        ValueError: for an optimizer that does not exist.
+    """
+    if config.name not in OPTIMIZERS:
+        raise ValueError(f"optimizer.name: got {config.name!r}, expected one of {', '.join(OPTIMIZERS)}")
     peak, warmup = config.learning_rate, round(config.warmup * steps)
     then = optax.cosine_decay_schedule(peak, steps - warmup) if config.cosine else optax.constant_schedule(peak)
     rate = optax.join_schedules([optax.linear_schedule(0.0, peak, max(warmup, 1)), then], [warmup])
     clip = optax.identity() if config.clip_norm is None else optax.clip_by_global_norm(config.clip_norm)
-    return optax.chain(clip, optax.adam(rate))
+    if config.name == "adam":
+        return optax.chain(clip, optax.adam(rate))
+    # Learned rates of the inner step are scalars, and biases vectors, which have no orthogonal matrix near them.
+    return optax.chain(clip, optax.contrib.muon(rate, muon_weight_dimension_numbers=_kernels, consistent_rms=1.0))
+
+
+def _kernels(params: Params) -> Any:
+    """Tells Muon how to read a kernel [..., F] as a matrix with F columns; None for all other parameters."""
+
+    def read(path: tuple, x: jax.Array) -> optax.contrib.MuonDimensionNumbers | None:
+        if getattr(path[-1], "key", None) != "kernel" or x.ndim < 2:
+            return None
+        return optax.contrib.MuonDimensionNumbers(tuple(range(x.ndim - 1)), (x.ndim - 1,))
+
+    return jax.tree_util.tree_map_with_path(read, params)
 
 
 Loss = Callable[[Params, TaskBatch], tuple[jax.Array, dict[str, jax.Array]]]

@@ -1,5 +1,7 @@
 """The meta-optimizer: what it does to a constant gradient is minus the learning rate."""
 
+import re
+
 import jax.numpy as jnp
 import numpy as np
 import optax
@@ -45,3 +47,28 @@ def test_the_global_norm_is_clipped():
     first_moment = optax.tree.get(state, "mu")
     np.testing.assert_allclose(first_moment, 0.1 * np.array([0.6, 0.8]), rtol=1e-5)
     assert update.shape == (2,)
+
+
+@pytest.mark.parametrize("shape", [(288, 32), (20, 50), (3, 3, 8, 16)])
+def test_muon_moves_a_kernel_by_an_orthogonal_matrix_near_its_gradient(shape):
+    """Compares with the singular value decomposition G = U S V^T: the matrix is U V^T, and its root mean square 1."""
+    gradient = np.random.default_rng(0).standard_normal(shape)
+    params = {"policy": {"kernel": jnp.zeros(shape), "bias": jnp.zeros(shape[-1])}, "rate": {"kernel": jnp.zeros(())}}
+    optimizer = make_optimizer(OptimizerConfig(name="muon", learning_rate=3e-3), STEPS)
+    grads = {"policy": {"kernel": jnp.asarray(gradient), "bias": jnp.ones(shape[-1])}, "rate": {"kernel": jnp.ones(())}}
+    update, _ = optimizer.update(grads, optimizer.init(params), params)
+    moved = -np.asarray(update["policy"]["kernel"]).reshape(-1, shape[-1])
+    u, _, v = np.linalg.svd(gradient.reshape(-1, shape[-1]), full_matrices=False)
+    nearest = u @ v
+    cosine = (moved * nearest).sum() / np.linalg.norm(moved) / np.linalg.norm(nearest)
+    assert cosine > 0.98, "five steps of Newton and Schulz come near it"
+    assert np.sqrt(np.square(moved).mean()) == pytest.approx(3e-3, rel=0.25)
+    others = optax.nadam(3e-3)
+    expected = float(others.update(jnp.ones(()), others.init(jnp.zeros(())))[0])
+    np.testing.assert_allclose(update["policy"]["bias"], expected, rtol=1e-4)
+    np.testing.assert_allclose(update["rate"]["kernel"], expected, rtol=1e-4)
+
+
+def test_an_optimizer_that_does_not_exist():
+    with pytest.raises(ValueError, match=re.escape("optimizer.name: got 'sgd', expected one of adam, muon")):
+        make_optimizer(OptimizerConfig(name="sgd"), STEPS)
