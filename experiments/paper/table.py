@@ -13,9 +13,9 @@ LABELS = {"mil": "MIL", "lstm": "LSTM", "lstm_attention": "LSTM with attention"}
 
 
 def method(result: dict) -> str:
-    """Names what was trained, and whether with milx's goal head, which attention has no use for."""
+    """Names what was trained, and whether with milx's goal head, which attention does not have."""
     name = result["method"]
-    has_goal_head = result["config"]["network"]["goal_head"] and name != "lstm_attention"
+    has_goal_head = name != "lstm_attention" and result["config"]["network"]["goal_head"]
     return LABELS.get(name, name) + (" + goal head" if has_goal_head else "")
 
 

@@ -7,7 +7,7 @@ import typing
 from collections.abc import Mapping
 from typing import Any
 
-from milx.config.schema import Config
+from milx.config.schema import Config, ConvConfig
 
 MOST = 10**9
 """The maximum of integer fields that declare none."""
@@ -22,7 +22,7 @@ def check_config(config: Config) -> None:
     """
     _check_group(config, "")
     network = config.network
-    if len(network.filters) != len(network.strides):
+    if isinstance(network, ConvConfig) and len(network.filters) != len(network.strides):
         expected = f"as many as network.filters = {network.filters}"
         raise ValueError(f"network.strides: got {network.strides}, expected {expected}")
 

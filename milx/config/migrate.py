@@ -1,12 +1,13 @@
 """Conversion of configurations with an earlier layout, as result files and stored policies contain them.
 
 Version 1 had no version number. All methods shared one class of network settings and one group "mil", so a
-configuration also held fields that its method did not use.
+configuration also held fields that its method did not use. In version 2, `lstm_attention` still had the settings of
+convolutions and of a goal head.
 """
 
 from typing import Any
 
-VERSION = 2
+VERSION = 3
 
 _OF_ALL = ("loss_scale", "whiten_actions", "goal_weight", "given")
 _NETWORK: dict[Any, tuple[str, ...]] = {
@@ -19,6 +20,10 @@ _NETWORK: dict[Any, tuple[str, ...]] = {
     "lstm_attention": ("context",),
 }
 """By method: the fields of its networks' settings that not all methods have."""
+_OF_VISION = (
+    *("filters", "strides", "kernel", "fixed_filters", "mixed_precision", "rematerialise", "soft_argmax"),
+    *("goal_head", "calibrate"),
+)
 
 
 def migrate(values: dict[str, Any]) -> dict[str, Any]:
@@ -28,10 +33,12 @@ def migrate(values: dict[str, Any]) -> dict[str, Any]:
         ValueError: for an unknown version.
     """
     version = values.get("config_version", 1)
-    if version not in (1, VERSION):
+    if version not in (1, 2, VERSION):
         raise ValueError(f"config_version: got {version!r}, expected at most {VERSION}: made by a later milx")
     values = {name: value for name, value in values.items() if name != "config_version"}
-    return values if version == VERSION else _from_version_1(values)
+    if version == 1:
+        values = _from_version_1(values)
+    return values if version == VERSION else _from_version_2(values)
 
 
 def _from_version_1(values: dict[str, Any]) -> dict[str, Any]:
@@ -48,3 +55,10 @@ def _from_version_1(values: dict[str, Any]) -> dict[str, Any]:
     rest = {name: value for name, value in values.items() if name not in groups}
     groups = {"method": method, "network": network, "train": train}
     return rest | {name: group for name, group in groups.items() if group}
+
+
+def _from_version_2(values: dict[str, Any]) -> dict[str, Any]:
+    network = values.get("network")
+    if values.get("method_name") != "lstm_attention" or not isinstance(network, dict):
+        return values
+    return values | {"network": {name: value for name, value in network.items() if name not in _OF_VISION}}

@@ -1,8 +1,8 @@
 """All hyperparameters, as plain dataclasses. Each field defines the minimum and the maximum of its numbers.
 
 Two groups depend on the method: `Config.network` and `Config.method` are instances of the classes that the method was
-registered with (`milx.config.registry`). These classes extend `NetworkConfig` and `MethodConfig`. The launchers' flag
-`--config.path.to.field=value` overrides one field.
+registered with (`milx.config.registry`). These classes extend `NetworkConfig`, or `VisionConfig` where the networks see
+images, and `MethodConfig`. The launchers' flag `--config.path.to.field=value` overrides one field.
 """
 
 import dataclasses
@@ -81,7 +81,22 @@ class RecordedConfig:
 
 @dataclasses.dataclass
 class NetworkConfig:
-    """The networks of all methods: convolutions, then fully connected layers that also receive the robot's state.
+    """The fully connected layers that the networks of all methods have.
+
+    Attributes:
+        fc_layers: sizes of the hidden fully connected layers.
+        fc_norm: apply layer norm in the hidden fully connected layers.
+        fc_init_std: standard deviation of the initial weights of these layers; None for LeCun's initialization.
+    """
+
+    fc_layers: tuple[int, ...] = number((200, 200, 200, 200), 1, LARGEST_SIZE)
+    fc_norm: bool = True
+    fc_init_std: float | None = number(None, 0)
+
+
+@dataclasses.dataclass
+class ConvConfig:
+    """The convolutions of networks that see images.
 
     Attributes:
         filters: output channels of each convolution.
@@ -95,12 +110,6 @@ class NetworkConfig:
             This takes less memory and more time; the results are the same.
         soft_argmax: apply a spatial soft-argmax with a learned temperature after the last convolution; otherwise its
             output is flattened.
-        fc_layers: sizes of the hidden fully connected layers.
-        fc_norm: apply layer norm in the hidden fully connected layers.
-        fc_init_std: standard deviation of the initial weights of these layers; None for LeCun's initialization.
-        goal_head: predict the goal from the image, or from the state if the policy sees no pixels, and pass the
-            prediction on to the following layers (`milx.networks.goal`).
-        calibrate: initialize the goal head's votes from the camera's calibration, if it is known.
     """
 
     filters: tuple[int, ...] = number((40, 40, 40), 1, LARGEST_SIZE)
@@ -110,9 +119,18 @@ class NetworkConfig:
     mixed_precision: bool = False
     rematerialise: bool = False
     soft_argmax: bool = False
-    fc_layers: tuple[int, ...] = number((200, 200, 200, 200), 1, LARGEST_SIZE)
-    fc_norm: bool = True
-    fc_init_std: float | None = number(None, 0)
+
+
+@dataclasses.dataclass
+class VisionConfig(NetworkConfig, ConvConfig):  # in this order of the bases, fields of convolutions come first
+    """Convolutions, then fully connected layers that also receive the robot's state, and a goal head.
+
+    Attributes:
+        goal_head: predict the goal from the image, or from the state if the policy sees no pixels, and pass the
+            prediction on to the following layers (`milx.networks.goal`).
+        calibrate: initialize the goal head's votes from the camera's calibration, if it is known.
+    """
+
     goal_head: bool = False
     calibrate: bool = True
 

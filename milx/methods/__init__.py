@@ -4,11 +4,12 @@ import jax
 import numpy as np
 
 from milx.config.registry import METHODS, register_method
-from milx.config.schema import GIVEN, Config
+from milx.config.schema import GIVEN, Config, ConvConfig
 from milx.methods.base import Method
 from milx.methods.contextual import make_contextual, make_lstm, make_lstm_attention
 from milx.methods.mil import MILConfig, make_mil
 from milx.methods.whitening import Whitening
+from milx.networks.attention import AttentionConfig
 from milx.networks.encoders import ContextConfig, RecurrentConfig
 from milx.networks.policy_network import PolicyConfig
 from milx.types import Params, Spec
@@ -21,7 +22,7 @@ _LAST_STEP, _ALL_STEPS = {"train.support_frames": 1}, {"train.support_frames": N
 register_method("mil", make_mil, PolicyConfig, MILConfig)
 register_method("contextual", make_contextual, ContextConfig, overrides=_LAST_STEP)
 register_method("lstm", make_lstm, RecurrentConfig, overrides=_ALL_STEPS)
-register_method("lstm_attention", make_lstm_attention, ContextConfig, overrides=_ALL_STEPS)
+register_method("lstm_attention", make_lstm_attention, AttentionConfig, overrides=_ALL_STEPS)
 
 
 def make(config: Config, spec: Spec) -> Method:
@@ -42,9 +43,9 @@ def make(config: Config, spec: Spec) -> Method:
         raise ValueError(f"method.given: got {config.method.given!r}, expected one of {', '.join(GIVEN)}")
     if config.method.given == "video" and spec.image_shape is None:
         raise ValueError("method.given: got 'video', expected the state, too: this policy sees no pixels")
-    if config.network.fixed_filters is not None and spec.image_shape is None:
-        expected_filters = "None: this policy sees no pixels"
-        raise ValueError(f"network.fixed_filters: got {config.network.fixed_filters!r}, expected {expected_filters}")
+    fixed = config.network.fixed_filters if isinstance(config.network, ConvConfig) else None
+    if fixed is not None and spec.image_shape is None:
+        raise ValueError(f"network.fixed_filters: got {fixed!r}, expected None: this policy sees no pixels")
     method = entry.make(config, spec)
     assert isinstance(method, Method)
     return method

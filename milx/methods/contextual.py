@@ -3,6 +3,7 @@
 import dataclasses
 from typing import Any
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
@@ -10,7 +11,7 @@ from milx.config.schema import Config, MethodConfig
 from milx.methods.base import Method
 from milx.methods.imitation import behavioral_cloning, calibrate_goal_head, calibration, flat, shown
 from milx.methods.whitening import Whitening
-from milx.networks.attention import AttentiveActor, ObjectTokens
+from milx.networks.attention import AttentionConfig, AttentiveActor, ObjectTokens
 from milx.networks.encoders import (
     Actor,
     ContextConfig,
@@ -88,13 +89,13 @@ class ContextPolicy(Method):
 def make_contextual(config: Config, spec: Spec) -> ContextPolicy:
     """Builds the policy that sees a demonstration's last frame."""
     assert isinstance(config.network, ContextConfig)
-    return _with_context(config, spec, LastFrame(config.network))
+    return _with_context(config, spec, LastFrame(config.network), _actor(config.network, spec))
 
 
 def make_lstm(config: Config, spec: Spec) -> ContextPolicy:
     """Builds the policy whose LSTM reads a demonstration."""
     assert isinstance(config.network, RecurrentConfig)
-    return _with_context(config, spec, Recurrent(config.network))
+    return _with_context(config, spec, Recurrent(config.network), _actor(config.network, spec))
 
 
 def make_lstm_attention(config: Config, spec: Spec) -> ContextPolicy:
@@ -103,7 +104,7 @@ def make_lstm_attention(config: Config, spec: Spec) -> ContextPolicy:
     Raises:
         ValueError: where the state does not tell where the objects are.
     """
-    assert isinstance(config.network, ContextConfig)
+    assert isinstance(config.network, AttentionConfig)
     if not spec.object_indices:
         expected = "another: the state does not tell where the objects are"
         raise ValueError(f"method: got 'lstm_attention', expected {expected}")
@@ -111,7 +112,10 @@ def make_lstm_attention(config: Config, spec: Spec) -> ContextPolicy:
     return _with_context(config, spec, ObjectTokens(config.network, spec.object_indices), actor)
 
 
-def _with_context(config: Config, spec: Spec, encoder: Any, actor: Any = None) -> ContextPolicy:
-    actor = actor or Actor(config.network, spec.action_size, goal_size=len(spec.goal_indices))
+def _actor(network: ContextConfig, spec: Spec) -> Actor:
+    return Actor(network, spec.action_size, goal_size=len(spec.goal_indices))
+
+
+def _with_context(config: Config, spec: Spec, encoder: nn.Module, actor: nn.Module) -> ContextPolicy:
     network = make_context_network(encoder, actor, spec.image_shape, spec.state_size, spec.action_size)
     return ContextPolicy(config.method, network, spec.goal_indices, calibration(config, spec))

@@ -6,7 +6,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-from milx.config.schema import GIVEN, Config, MethodConfig
+from milx.config.schema import GIVEN, Config, MethodConfig, VisionConfig
 from milx.methods.whitening import Whitening
 from milx.networks.goal import Goal, calibrate
 from milx.networks.policy_network import PolicyOutput
@@ -103,8 +103,9 @@ def _mean_where_known(
 
 def calibration(config: Config, spec: Spec) -> tuple[tuple[float, ...], ...] | None:
     """Returns the camera's calibration (`Spec.image_to_goal`) if goal heads are to start from it."""
-    calibrated = config.network.goal_head and config.network.calibrate and spec.image_shape is not None
-    return spec.image_to_goal if calibrated else None
+    network = config.network
+    calibrated = isinstance(network, VisionConfig) and network.goal_head and network.calibrate
+    return spec.image_to_goal if calibrated and spec.image_shape is not None else None
 
 
 def calibrate_goal_head(

@@ -4,17 +4,29 @@ Every object is embedded at every time step of the demonstration. While the poli
 for the time steps that matter, then for the object that matters now, and does so a second time with what it read.
 """
 
+import dataclasses
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from milx.config.schema import NetworkConfig
-from milx.networks.encoders import ContextConfig
+from milx.config.schema import LARGEST_SIZE, NetworkConfig, number
 from milx.networks.layers import Dense
 from milx.networks.policy_network import Controller, PolicyOutput
 
 _HOPS = 2
+
+
+@dataclasses.dataclass
+class AttentionConfig(NetworkConfig):
+    """The networks of the LSTM that attends to objects; they do not look at images.
+
+    Attributes:
+        context: units of the LSTM.
+    """
+
+    context: int = number(512, 1, LARGEST_SIZE)
 
 
 def separate_objects(state: jax.Array, object_indices: tuple[tuple[int, ...], ...]) -> tuple[jax.Array, jax.Array]:
@@ -27,7 +39,7 @@ def separate_objects(state: jax.Array, object_indices: tuple[tuple[int, ...], ..
 class ObjectTokens(nn.Module):
     """Embeds every object at every time step: its place, its number, the time, and what the robot is and does then."""
 
-    config: NetworkConfig
+    config: AttentionConfig
     object_indices: tuple[tuple[int, ...], ...]
 
     @nn.compact
@@ -48,7 +60,7 @@ class ObjectTokens(nn.Module):
 class AttentiveActor(nn.Module):
     """Acts on what it reads from the tokens. The weights of both attentions are sown as "intermediates"."""
 
-    config: ContextConfig
+    config: AttentionConfig
     action_size: int
     object_indices: tuple[tuple[int, ...], ...]
 

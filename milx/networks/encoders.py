@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from milx.config.schema import LARGEST_SIZE, NetworkConfig, number
+from milx.config.schema import LARGEST_SIZE, VisionConfig, number
 from milx.networks.goal import StateGoalHead
 from milx.networks.layers import Dense
 from milx.networks.policy_network import Controller, ConvStack, PolicyOutput
@@ -21,7 +21,7 @@ from milx.types import Params
 
 
 @dataclasses.dataclass
-class ContextConfig(NetworkConfig):
+class ContextConfig(VisionConfig):
     """The networks of a method without adaptation.
 
     Attributes:
@@ -96,7 +96,7 @@ class Recurrent(nn.Module):
 class Actor(nn.Module):
     """The policy that sees the context; its goal head looks for what the context asks for."""
 
-    config: NetworkConfig
+    config: VisionConfig
     action_size: int
     goal_size: int
 
@@ -109,7 +109,8 @@ class Actor(nn.Module):
         if self.config.goal_head:
             size = StateGoalHead.candidates if features is None else features.shape[-1]
             query = jnp.broadcast_to(Dense(size)(context), (len(state), size))
-        controller = Controller(self.config, self.action_size, self.goal_size, name="controller")
+        vision = self.config.soft_argmax, self.config.goal_head
+        controller = Controller(self.config, self.action_size, self.goal_size, *vision, name="controller")
         return controller(features, state, jnp.broadcast_to(context, (len(state), *context.shape)), query)
 
 

@@ -10,11 +10,11 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from milx.config.schema import NetworkConfig
+from milx.config.schema import ConvConfig
 from milx.types import Params
 
 KMEANS = "kmeans"
-"""The value of `NetworkConfig.fixed_filters` for a bank of the training images; any other is a file."""
+"""The value of `ConvConfig.fixed_filters` for a bank of the training images; any other is a file."""
 ITERATIONS = 30
 MEAN, STD = np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225])
 """Of the images that VGG-19 was trained on, by channel."""
@@ -34,7 +34,7 @@ class Filters(NamedTuple):
     bias: np.ndarray
 
 
-def read_filters(path: str, config: NetworkConfig) -> Filters:
+def read_filters(path: str, config: ConvConfig) -> Filters:
     """Reads VGG-19's first convolution from a .npz or .safetensors file with torchvision's names.
 
     The image's normalization becomes part of it. At the border it sees black where VGG-19 sees gray.
@@ -74,7 +74,7 @@ def _read(file: pathlib.Path) -> dict[str, np.ndarray]:
         raise ValueError(f"network.fixed_filters: {file} cannot be read: {error}") from error
 
 
-def cluster(images: np.ndarray, config: NetworkConfig) -> Filters:
+def cluster(images: np.ndarray, config: ConvConfig) -> Filters:
     """Makes filters of the clusters of the images' patches; the same for the same images.
 
     Args:

@@ -9,7 +9,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from milx.config.schema import LARGEST_SIZE, NetworkConfig, number
+from milx.config.schema import LARGEST_SIZE, ConvConfig, NetworkConfig, VisionConfig, number
 from milx.networks.goal import Goal, GoalHead, HindsightHead, StateGoalHead
 from milx.networks.layers import ConvBlock, Dense, FixedConv, SpatialSoftArgmax
 from milx.networks.learned_loss import LearnedLoss
@@ -17,7 +17,7 @@ from milx.types import Params
 
 
 @dataclasses.dataclass
-class PolicyConfig(NetworkConfig):
+class PolicyConfig(VisionConfig):
     """The network of MIL.
 
     Attributes:
@@ -91,7 +91,7 @@ class PolicyNetwork(NamedTuple):
 class ConvStack(nn.Module):
     """All convolutions: images [B, H, W, 3] uint8 to a feature map [B, H', W', C] of the parameters' type."""
 
-    config: NetworkConfig
+    config: ConvConfig
 
     @nn.compact
     def __call__(self, image: jax.Array, dtype: jnp.dtype) -> jax.Array:
@@ -109,15 +109,18 @@ class Controller(nn.Module):
     """From a feature map and the robot's state to an action.
 
     Attributes:
-        config: layers and goal head.
+        config: its layers.
         action_size: A.
-        goal_size: G; 0 for no goal head whatever `config` says.
+        goal_size: G; 0 for no goal head and no target head, whatever the following say.
+        soft_argmax, goal_head: as in `VisionConfig`.
         heads, inner_first_layer, target_head: as in `PolicyConfig`.
     """
 
     config: NetworkConfig
     action_size: int
     goal_size: int
+    soft_argmax: bool = False
+    goal_head: bool = False
     heads: int = 1
     inner_first_layer: bool = False
     target_head: bool = False
@@ -143,9 +146,9 @@ class Controller(nn.Module):
             target: [B, G] for a target head, see there; None if it is not known at all.
         """
         config, goal, seen_target = self.config, None, None
-        parts, has_goal = [state, context], config.goal_head and self.goal_size
+        parts, has_goal = [state, context], self.goal_head and self.goal_size
         if features is not None:
-            seen = SpatialSoftArgmax()(features) if config.soft_argmax else features.reshape(len(features), -1)
+            seen = SpatialSoftArgmax()(features) if self.soft_argmax else features.reshape(len(features), -1)
             parts = [seen, *parts]
             if self.target_head and self.goal_size:
                 first = jnp.repeat(seen[::length], length, axis=0)
@@ -185,8 +188,17 @@ class _Policy(nn.Module):
         config, size = self.config, self.config.bias_transformation
         z = self.param(BIAS_TRANSFORMATION, nn.initializers.zeros, (size,))
         features = None if image is None else ConvStack(config, name="vision")(image, state.dtype)
-        heads = config.heads, config.inner_first_layer, config.target_head
-        controller = Controller(config, self.action_size, self.goal_size, *heads, name="controller")
+        controller = Controller(
+            config,
+            self.action_size,
+            self.goal_size,
+            soft_argmax=config.soft_argmax,
+            goal_head=config.goal_head,
+            heads=config.heads,
+            inner_first_layer=config.inner_first_layer,
+            target_head=config.target_head,
+            name="controller",
+        )
         return controller(features, state, jnp.broadcast_to(z, (len(state), size)), None, length, target)
 
 

@@ -16,7 +16,7 @@ from rich.console import Console
 
 from milx.config import assemble
 from milx.config.check import check_config
-from milx.config.schema import GIVEN, Config
+from milx.config.schema import GIVEN, Config, ConvConfig
 from milx.data import RECORDED
 from milx.data.dataset import DataSet, spread
 from milx.data.recorded import MOST_DEMOS, Recorded, Shards, read_demos, sample_batch, with_goals
@@ -37,11 +37,11 @@ def make_config(path: str | pathlib.Path, method: str = "mil", preset: str = "fa
     """
     config, head = assemble.make_config(RECORDED, method, preset, seed), DataSet(path).header
     config.recorded.path = str(pathlib.Path(path).resolve())
-    if head.image_shape is None:
+    if head.image_shape is not None:
+        config.env.image_shape = head.image_shape
+    elif isinstance(config.network, ConvConfig):
         config.network.filters = config.network.strides = ()
         config.network.soft_argmax = config.network.mixed_precision = False
-    else:
-        config.env.image_shape = head.image_shape
     return config
 
 

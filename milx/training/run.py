@@ -25,7 +25,7 @@ from rich.console import Console
 
 from milx import methods
 from milx.config import assemble
-from milx.config.schema import Config
+from milx.config.schema import Config, ConvConfig
 from milx.core import parallel, platform, progress
 from milx.core.checkpoint import UNVALIDATED, Checkpoints
 from milx.evaluation import listening, results
@@ -132,14 +132,13 @@ class Run(abc.ABC):
             self._train(stop)
 
     def _train(self, stop: signals.Stop) -> None:
-        config = self.config.train
+        config, network = self.config.train, self.config.network
         with contextlib.closing(Checkpoints(self._checkpoints, report=self._warn)) as checkpoints:
             latest = checkpoints.latest
             if latest is not None and latest >= config.steps and checkpoints.score(latest) != UNVALIDATED:
                 return
-            filters = self.config.network.fixed_filters
-            if filters not in (None, fixed_filters.KMEANS):
-                fixed_filters.read_filters(filters, self.config.network)  # refuses a bad file before planning
+            if isinstance(network, ConvConfig) and network.fixed_filters not in (None, fixed_filters.KMEANS):
+                fixed_filters.read_filters(network.fixed_filters, network)  # refuses a bad file before planning
             compiled = self._compile_in_background()
             training = self._load()
             state, key = self._start(training, checkpoints)

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from milx.config.schema import Config
+from milx.config.schema import Config, ConvConfig
 from milx.core.checkpoint import UNVALIDATED, Checkpoints
 from milx.evaluation import provenance
 from milx.methods.whitening import Whitening
@@ -43,12 +43,13 @@ def initial_state(trainer: Trainer, config: Config, training: Training) -> tuple
     """Makes the state before the first meta-update on these demonstrations, and the key of the batches."""
     init_key, batch_key = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), 3))
     state = trainer.init(init_key, training.whitening)
-    if config.network.fixed_filters is None:
+    network = config.network
+    if not isinstance(network, ConvConfig) or network.fixed_filters is None:
         return state, batch_key
-    if config.network.fixed_filters == fixed_filters.KMEANS:
-        filters = fixed_filters.cluster(training.first_images(), config.network)
+    if network.fixed_filters == fixed_filters.KMEANS:
+        filters = fixed_filters.cluster(training.first_images(), network)
     else:
-        filters = fixed_filters.read_filters(config.network.fixed_filters, config.network)
+        filters = fixed_filters.read_filters(network.fixed_filters, network)
     return dataclasses.replace(state, params=fixed_filters.put(state.params, filters)), batch_key
 
 

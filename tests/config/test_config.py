@@ -175,11 +175,22 @@ def _as_json(value):
     return json.loads(json.dumps(value))
 
 
+def test_settings_that_attention_had_in_version_2_are_dropped():
+    network = {"filters": [], "strides": [], "kernel": 3, "goal_head": True, "fc_layers": [16], "context": 8}
+    values = {"config_version": 2, "method_name": "lstm_attention", "network": network}
+    expected = default_config("lstm_attention")
+    expected.network.fc_layers, expected.network.context = (16,), 8
+    assert assemble.from_dict(values) == expected
+    assert assemble.from_dict(values | {"method_name": "contextual"}).network.goal_head
+    with pytest.raises(ValueError, match=r"config\.network: no such field 'filters', expected one of fc_layers"):
+        assemble.from_dict(values | {"config_version": 3})
+
+
 def test_a_method_that_is_no_name_is_refused():
     with pytest.raises(ValueError, match="method"):
         assemble.from_dict({"method_name": [1]})
 
 
 def test_a_later_layout_is_refused():
-    with pytest.raises(ValueError, match="config_version: got 99, expected at most 2: made by a later milx"):
+    with pytest.raises(ValueError, match="config_version: got 99, expected at most 3: made by a later milx"):
         assemble.from_dict({"config_version": 99})

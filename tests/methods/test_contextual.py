@@ -33,7 +33,9 @@ def build(name, vision, goal_head=False):
         object_indices=() if vision else OBJECTS,
     )
     config = assemble.default_config(name)
-    sizes = {"filters": (4,) * vision, "strides": (2,) * vision, "fc_layers": (16, 16), "goal_head": goal_head}
+    sizes = {"fc_layers": (16, 16)}
+    if name != "lstm_attention":
+        sizes |= {"filters": (4,) * vision, "strides": (2,) * vision, "goal_head": goal_head}
     settings = {f"network.{field}": value for field, value in sizes.items()} | {"method.goal_weight": 1.0}
     if name == "mil":
         settings |= {"network.bias_transformation": 4, "method.inner_lr": 0.1, "method.learn_inner_lr": True}

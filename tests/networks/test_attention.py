@@ -5,12 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from milx.networks.attention import AttentiveActor, ObjectTokens, separate_objects
-from milx.networks.encoders import ContextConfig
+from milx.networks.attention import AttentionConfig, AttentiveActor, ObjectTokens, separate_objects
 
 STATE, ACTION, STEPS, BATCH = 7, 2, 5, 4
 OBJECTS = ((1, 2), (5, 6), (3, 4))
-CONFIG = ContextConfig(filters=(), strides=(), fc_layers=(16,), context=8)
+CONFIG = AttentionConfig(fc_layers=(16,), context=8)
 
 
 @pytest.fixture(scope="module")

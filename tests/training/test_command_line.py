@@ -66,6 +66,9 @@ def test_a_method_has_no_settings_of_another(tmp_path):
     said = train(tmp_path, "--method=lstm", "--config.method.inner_steps=7").stderr
     assert "--config.method.inner_steps: no such field with --method=lstm, expected one of" in said
     assert "method.given" in said and "network.context_frames" in said and "network.heads" not in said
+    said = train(tmp_path, "--env=reach_state", "--method=lstm_attention", "--config.network.filters=(4,)").stderr
+    assert "--config.network.filters: no such field with --method=lstm_attention, expected one of" in said
+    assert "network.fc_layers" in said and "network.kernel" not in said
 
 
 def test_a_package_of_ones_own_is_found(tmp_path, monkeypatch):
