@@ -1,7 +1,12 @@
 """Where the robot was heading at each step of a demonstration, read off its states: what a goal head learns to see."""
 
+import dataclasses
+import functools
+
 import jax
 import jax.numpy as jnp
+
+from milx.types import Demo
 
 
 def goals(state: jax.Array, indices: tuple[int, ...], height: int | None) -> jax.Array:
@@ -23,3 +28,11 @@ def goals(state: jax.Array, indices: tuple[int, ...], height: int | None) -> jax
     low = z < (z.min() + z.max()) / 2
     down = jnp.argmax(low & (time > jnp.argmin(low)))
     return jnp.where(time[:, None] < down, place[down], jnp.nan)
+
+
+def with_goals(demo: Demo, indices: tuple[int, ...], height: int | None) -> Demo:
+    """Adds the `goals` to demonstrations [..., T, ...], if entries of their states tell them."""
+    if demo.state is None or not indices:
+        return demo
+    compute = jnp.vectorize(functools.partial(goals, indices=indices, height=height), signature="(t,s)->(t,g)")
+    return dataclasses.replace(demo, goal=compute(demo.state))

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from milx.data.dataset import DataSet, spread
-from milx.data.goals import goals
+from milx.data.goals import with_goals
 from milx.data.simulated import frame_indices
 from milx.types import Array, Demo, TaskBatch
 
@@ -106,7 +106,7 @@ def sample_batch(
         def show(d: jax.Array, key: jax.Array, frames: int | None) -> Demo:
             index = frame_indices(key, horizon, frames)
             demo = jax.tree.map(lambda x: x[n, d], recorded.demo)
-            return jax.tree.map(lambda x: x[index], with_goals(demo, goal_indices))
+            return jax.tree.map(lambda x: x[index], with_goals(demo, goal_indices, None))
 
         shown = [show(chosen[k], frame_keys[k], support_frames) for k in range(shots)]
         asked = show(query, frame_keys[shots], query_frames)
@@ -117,11 +117,6 @@ def sample_batch(
         )
 
     return jax.vmap(sample_task)(keys)
-
-
-def with_goals(demo: Demo, indices: tuple[int, ...]) -> Demo:
-    """Adds the goals to a demonstration [T, ...], if entries of the state tell them."""
-    return dataclasses.replace(demo, goal=goals(demo.state, indices, None)) if indices else demo
 
 
 class Shards:

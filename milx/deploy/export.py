@@ -18,8 +18,9 @@ from jax import export as jax_export
 
 from milx import envs
 from milx.config.schema import GIVEN
+from milx.data.goals import with_goals
 from milx.deploy import standalone
-from milx.deploy.policy import Policy, with_goals
+from milx.deploy.policy import Policy
 from milx.types import Demo, Observation, Params, Spec
 
 PLATFORMS = ("cpu", "cuda")
@@ -43,7 +44,8 @@ def export(policy: Policy, out: str | pathlib.Path, shots: int = 1) -> None:
     leaves, structure = jax.tree.flatten(policy.params)
 
     def learn(params: Params, demo: dict[str, jax.Array]) -> Params:
-        return policy.method.adapt(params, with_goals(Demo(**_with_state(demo, policy.spec)), policy.spec))
+        shown = Demo(**_with_state(demo, policy.spec))
+        return policy.method.adapt(params, with_goals(shown, policy.spec.goal_indices, policy.spec.height_index))
 
     def adapt(leaves: list[jax.Array], demo: dict[str, jax.Array]) -> list[jax.Array]:
         return jax.tree.leaves(learn(jax.tree.unflatten(structure, leaves), demo))

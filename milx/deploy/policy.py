@@ -13,7 +13,7 @@ from milx import envs, methods
 from milx.config import assemble
 from milx.config.schema import GIVEN, Config
 from milx.core.checkpoint import Checkpoints
-from milx.data.goals import goals
+from milx.data.goals import with_goals
 from milx.methods import Method
 from milx.types import SPEC_FILE, Demo, Memory, Observation, Params, Spec, TaskParams
 
@@ -161,15 +161,7 @@ def check_demo(demo: Demo, spec: Spec, given: str = GIVEN[0]) -> Demo:
         checked = dataclasses.replace(checked, action=_check_action(demo.action, shape, spec))
     if not lead:
         checked = jax.tree.map(lambda x: x[None], checked)
-    return with_goals(checked, spec)
-
-
-def with_goals(demo: Demo, spec: Spec) -> Demo:
-    """Adds the goals to demonstrations [K, T, ...] if they can be read from the states."""
-    if demo.state is None or not spec.goal_indices:
-        return demo
-    goal = jax.vmap(lambda state: goals(state, spec.goal_indices, spec.height_index))(demo.state)
-    return dataclasses.replace(demo, goal=goal)
+    return with_goals(checked, spec.goal_indices, spec.height_index)
 
 
 def _check_action(value: Any, shape: tuple[int, ...], spec: Spec) -> np.ndarray:

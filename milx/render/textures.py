@@ -5,8 +5,9 @@ family repeats with a period of about 1 in each direction; a texture's frame sca
 out is a family, not another size of one that was trained on.
 """
 
+import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -108,6 +109,13 @@ def draw(key: jax.Array, split: str) -> Textures:
     period = jax.random.uniform(period_key, minval=PERIOD[0], maxval=PERIOD[1])
     shift = jax.random.uniform(shift_key, (3, 1))
     return Textures(family, jax.random.uniform(color_key, (3,)), jnp.concatenate([turn / period, shift], axis=1))
+
+
+def draw_looks(key: jax.Array, split: str, count: int) -> dict[str, Any]:
+    """Samples a "color" [N, 3], RGB in [0, 1], and a "texture" [N] for each of N = `count` bodies of a task."""
+    color_key, texture_key = jax.random.split(key)
+    texture = jax.vmap(functools.partial(draw, split=split))(jax.random.split(texture_key, count))
+    return {"color": jax.random.uniform(color_key, (count, 3)), "texture": texture}
 
 
 def seen_from(frame: jax.Array, xpos: jax.Array, xmat: jax.Array) -> jax.Array:

@@ -19,7 +19,8 @@ from milx.config.check import check_config
 from milx.config.schema import GIVEN, Config, ConvConfig
 from milx.data import RECORDED
 from milx.data.dataset import DataSet, spread
-from milx.data.recorded import MOST_DEMOS, Recorded, Shards, read_demos, sample_batch, with_goals
+from milx.data.goals import with_goals
+from milx.data.recorded import MOST_DEMOS, Recorded, Shards, read_demos, sample_batch
 from milx.evaluation import plots, results
 from milx.evaluation.open_loop import task_errors
 from milx.methods import whitening
@@ -221,5 +222,4 @@ class RecordedRun(Run):
         fill = MOST_DEMOS - len(shown) - len(asked)
         rest = lambda x: np.pad(x[shots:], [(0, fill)] + [(0, 0)] * (x.ndim - 1))  # noqa: E731
         queries = Recorded(recorded.number, *jax.tree.map(rest, (recorded.demo, recorded.there, recorded.acts)))
-        indices = tuple(self.config.recorded.goal_indices)
-        return queries, jax.vmap(lambda demo: with_goals(demo, indices))(support)
+        return queries, with_goals(support, tuple(self.config.recorded.goal_indices), None)

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from milx.data.goals import goals
+from milx.data.goals import goals, with_goals
+from milx.types import Demo
 
 #                  x    y    height
 STATE = np.array(
@@ -18,3 +19,12 @@ def test_with_a_height_it_is_where_the_hand_comes_down_until_it_has():
     """Starts low and rises. The middle of its heights is 0.11: the hand is down from the fourth step on."""
     expected = [[7.0, 3.0]] * 3 + [[np.nan, np.nan]] * 3
     np.testing.assert_array_equal(goals(STATE, (1, 0), 2), expected)
+
+
+def test_goals_are_added_to_one_demonstration_or_to_several():
+    demo = Demo(state=STATE)
+    np.testing.assert_array_equal(with_goals(demo, (0, 1), 2).goal, goals(STATE, (0, 1), 2))
+    several = with_goals(Demo(state=np.stack([STATE, STATE[::-1]])), (0, 1), None)
+    np.testing.assert_array_equal(several.goal[:, 0], [[5.0, 9.0], [0.0, 4.0]])
+    assert with_goals(demo, (), None).goal is None
+    assert with_goals(Demo(action=STATE), (0, 1), None).goal is None

@@ -135,25 +135,25 @@ class Place(Env[PlaceTask]):
             thing_size=jax.random.uniform(keys[2], minval=THING_SIZE[0], maxval=THING_SIZE[1]),
             container=jax.random.choice(keys[3], kinds, (NUM_CONTAINERS,), replace=False),
             container_size=jax.random.uniform(keys[4], (NUM_CONTAINERS,), minval=low, maxval=high),
-            **_draw_looks(keys[5], split),
+            **textures.draw_looks(keys[5], split, 1 + NUM_CONTAINERS),
         )
 
     def redraw_appearance(self, key: jax.Array, task: PlaceTask) -> PlaceTask:
         """Gives the same thing and containers other colors and textures."""
-        return dataclasses.replace(task, **_draw_looks(key, "train"))
+        return dataclasses.replace(task, **textures.draw_looks(key, "train", 1 + NUM_CONTAINERS))
 
     def reset(self, key: jax.Array, task: PlaceTask) -> State:
         """Holds the thing over the table and stands the containers on it, at least SPACING apart."""
         place_key, joint_key = jax.random.split(key)
         noise = jax.random.uniform(joint_key, (NUM_JOINTS,), minval=-START_NOISE, maxval=START_NOISE)
-        place = _first_spaced(_draw_places(place_key))
+        place = _best_spaced(_draw_places(place_key))
         ground = jnp.zeros((NUM_CONTAINERS, 1))
         return State(jnp.array(_START) + noise, jnp.zeros(NUM_JOINTS), jnp.concatenate([place, ground], axis=-1))
 
     def redraw_scene(self, key: jax.Array, task: PlaceTask, states: State) -> State:
         """Keeps the motion and the target, and moves the two other containers elsewhere."""
         target = states.mocap_pos[0, task.target, :2]
-        place = _first_spaced(_draw_places(key).at[:, task.target].set(target))
+        place = _best_spaced(_draw_places(key).at[:, task.target].set(target))
         return dataclasses.replace(states, mocap_pos=states.mocap_pos.at[..., :2].set(place))
 
     @functools.partial(jax.jit, static_argnums=0)
@@ -290,21 +290,13 @@ def _top(geoms: primitives.Geoms) -> float:
     return float(tops[geoms.seen].max())
 
 
-def _draw_looks(key: jax.Array, split: str) -> dict[str, Any]:
-    """Samples colors and textures of the thing and of the containers."""
-    count = 1 + NUM_CONTAINERS
-    color_key, texture_key = jax.random.split(key)
-    texture = jax.vmap(functools.partial(textures.draw, split=split))(jax.random.split(texture_key, count))
-    return {"color": jax.random.uniform(color_key, (count, 3)), "texture": texture}
-
-
 def _draw_places(key: jax.Array) -> jax.Array:
     """Samples [_CANDIDATES, 3, 2] positions on the table (m)."""
     shape = (_CANDIDATES, NUM_CONTAINERS, 2)
     return jax.random.uniform(key, shape, minval=jnp.array(LOW), maxval=jnp.array(HIGH))
 
 
-def _first_spaced(draws: jax.Array) -> jax.Array:
+def _best_spaced(draws: jax.Array) -> jax.Array:
     """Returns the first of the draws that keeps the distances, or the one that comes closest to it: [3, 2]."""
     gap = jnp.linalg.norm(draws[:, [0, 0, 1]] - draws[:, [1, 2, 2]], axis=-1).min(axis=-1)
     return draws[jnp.argmax(jnp.minimum(gap, SPACING))]

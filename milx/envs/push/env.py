@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -119,12 +118,12 @@ class Push(Env[PushTask]):
             size=draw(size_key, SIZE),
             mass=draw(mass_key, MASS),
             damping=draw(damping_key, DAMPING),
-            **_draw_looks(look_key, split),
+            **textures.draw_looks(look_key, split, 2),
         )
 
     def redraw_appearance(self, key: jax.Array, task: PushTask) -> PushTask:
         """Gives the same objects other colors and textures."""
-        return dataclasses.replace(task, **_draw_looks(key, "train"))
+        return dataclasses.replace(task, **textures.draw_looks(key, "train", 2))
 
     def redraw_scene(self, key: jax.Array, task: PushTask, states: State) -> State:
         """Returns the same states: both objects may have been touched."""
@@ -265,13 +264,6 @@ class Push(Env[PushTask]):
     def task_blind(self, key: jax.Array, task: PushTask) -> PushTask:
         """Makes a random object the target."""
         return dataclasses.replace(task, target=jax.random.randint(key, (), 0, 2))
-
-
-def _draw_looks(key: jax.Array, split: str) -> dict[str, Any]:
-    """Samples colors and textures of two objects."""
-    color_key, texture_key = jax.random.split(key)
-    texture = jax.vmap(functools.partial(textures.draw, split=split))(jax.random.split(texture_key))
-    return {"color": jax.random.uniform(color_key, (2, 3)), "texture": texture}
 
 
 def _build() -> mujoco.MjModel:
