@@ -5,6 +5,7 @@ python experiments/notebooks/execute.py quickstart    # executes one
 """
 
 import pathlib
+import re
 import sys
 import tempfile
 
@@ -14,6 +15,8 @@ from nbclient import NotebookClient
 
 FOLDER = pathlib.Path(__file__).parent
 WIDGET = "application/vnd.jupyter.widget-view+json"
+TEMPORARY = re.compile(re.escape(tempfile.gettempdir()) + r"/tmp\w{8}")
+"""The path of a folder that `tempfile` has made."""
 
 
 def executed(name: str, folder: pathlib.Path) -> nbformat.NotebookNode:
@@ -38,6 +41,11 @@ def _is_shown(output: nbformat.NotebookNode) -> bool:
     return WIDGET not in output.data and output.data.get("text/plain") != ""
 
 
+def neutral(text: str) -> str:
+    """Replaces the paths of temporary folders, which are others in every run, by one that stays the same."""
+    return TEMPORARY.sub("/tmp/notebook", text)
+
+
 def main(argv: list[str]) -> None:
     """Executes the named notebooks, or all of them."""
     for name in argv[1:] or sorted(path.stem for path in FOLDER.glob("*.ipynb")):
@@ -47,7 +55,7 @@ def main(argv: list[str]) -> None:
             if cell.cell_type == "code":
                 cell.outputs = [output for output in cell.outputs if _is_shown(output)]
         notebook.metadata.pop("widgets", None)
-        nbformat.write(notebook, FOLDER / f"{name}.ipynb")
+        (FOLDER / f"{name}.ipynb").write_text(neutral(nbformat.writes(notebook)) + "\n")
         print(f"{name}: done", flush=True)
 
 
