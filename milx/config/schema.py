@@ -162,8 +162,8 @@ class OptimizerConfig:
 
     Attributes:
         name: one of OPTIMIZERS. "adam" (Kingma and Ba 2015) is the published one. "muon" (Jordan et al. 2024) replaces
-            the moving average of a kernel's gradient by an orthogonal matrix near it, of root mean square 1; the other
-            parameters have Adam with Nesterov's momentum (Dozat 2016).
+            the moving average of a kernel's gradient by an orthogonal matrix near it, of root mean square 0.4; the
+            other parameters have Adam with Nesterov's momentum (Dozat 2016).
         learning_rate: the maximum learning rate.
         warmup: fraction of the meta-updates in which the learning rate rises linearly from zero.
         cosine: let the learning rate decay to zero along a cosine over the rest of the run; otherwise it is constant.

@@ -33,7 +33,7 @@ from milx.methods.imitation import (
     shown,
 )
 from milx.methods.whitening import Whitening
-from milx.networks.goal import Goal
+from milx.networks.goal import Goal, sharpen
 from milx.networks.learned_loss import KINDS
 from milx.networks.policy_network import BIAS_TRANSFORMATION, PolicyConfig, PolicyNetwork, PolicyOutput, make_policy
 from milx.types import Demo, Memory, Observation, Params, Spec, TaskBatch, TaskParams
@@ -56,6 +56,8 @@ class MILConfig(MethodConfig):
         first_order: do not differentiate through the inner gradient.
         variant: one of VARIANTS: what the inner step changes, or which of its results the meta-objective sees.
         imitation_steps: so many meta-updates, the first, imitate all demonstrations without an inner step.
+        sharpness: the power to which an adapted policy raises the weights of its goal head's votes. Above 1, votes that
+            are divided between two objects fall to one of them. Meta-training always uses 1.
     """
 
     inner_steps: int = number(1, 0, 1000)
@@ -65,6 +67,7 @@ class MILConfig(MethodConfig):
     first_order: bool = False
     variant: str = "maml"
     imitation_steps: int = number(0, 0)
+    sharpness: float = number(1.0, 0)
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
@@ -128,8 +131,15 @@ class MIL(Method):
         return params
 
     def adapt(self, params: Params, demo: Demo) -> TaskParams:
-        """Takes the inner gradient steps on demonstrations [K, T, ...]: their gradients are averaged."""
-        return {"policy": self._steps(params, demo)[-1], "whitening": params["whitening"]}
+        """Takes the inner gradient steps on demonstrations [K, T, ...]: their gradients are averaged.
+
+        Then the weights of the votes of a goal head are raised to the power of `config.sharpness`.
+        """
+        theta = self._steps(params, demo)[-1]
+        if self.config.sharpness != 1 and "goal_head" in (controller := theta["controller"]):
+            head = sharpen(controller["goal_head"], self.config.sharpness)
+            theta = {**theta, "controller": {**controller, "goal_head": head}}
+        return {"policy": theta, "whitening": params["whitening"]}
 
     def _steps(self, params: Params, demo: Demo) -> list[Params]:
         """Takes the inner steps, and returns the network's parameters before them and after each."""

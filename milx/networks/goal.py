@@ -128,3 +128,11 @@ def calibrate(params: Params, image_to_goal: jax.Array) -> Params:
         image_to_goal: [3, G], takes (x, y, 1) with x and y in [-1, 1] across and down the image to a whitened goal.
     """
     return {**params, "vote": image_to_goal}
+
+
+def sharpen(params: Params, power: float) -> Params:
+    """Raises the weights of a `GoalHead`'s or a `StateGoalHead`'s votes to a power, and returns its parameters.
+
+    The weights are a softmax of what is linear in "kernel" or "heat", so those are multiplied.
+    """
+    return {name: power * x if name in ("kernel", "heat") else x for name, x in params.items()}

@@ -3,10 +3,11 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from scipy.special import softmax
 from scipy.stats import multivariate_normal
 
-from milx.networks.goal import Goal, GoalHead, HindsightHead, StateGoalHead
+from milx.networks.goal import Goal, GoalHead, HindsightHead, StateGoalHead, sharpen
 from milx.networks.layers import positions
 
 BATCH, HEIGHT, WIDTH, CHANNELS, GOAL = 5, 3, 4, 6, 2
@@ -100,3 +101,18 @@ def test_hindsight_is_where_the_first_image_differs_from_the_last(rng):
     found = HindsightHead(GOAL).apply({"params": params}, jnp.asarray(seen))
     where = np.array([3 / WIDTH - 1, 5 / HEIGHT - 1, 1.0])
     np.testing.assert_allclose(found.mean[0], where @ vote, rtol=1e-9)
+
+
+HEADS = {"image": (GoalHead(GOAL), (BATCH, HEIGHT, WIDTH, CHANNELS)), "state": (StateGoalHead(GOAL), (BATCH, 7))}
+
+
+@pytest.mark.parametrize("name", HEADS)
+def test_sharpened_weights_are_their_power_and_the_votes_stay(rng, name):
+    head, shape = HEADS[name]
+    seen = jnp.asarray(rng.standard_normal(shape))
+    params = head.init(jax.random.key(0), seen)["params"]
+    params = jax.tree.map(lambda x: jnp.asarray(rng.standard_normal(x.shape)), params)
+    before, after = (head.apply({"params": p}, seen) for p in (params, sharpen(params, 3.0)))
+    cubed = np.exp(before.log_weight) ** 3
+    np.testing.assert_allclose(np.exp(after.log_weight), cubed / cubed.sum(axis=-1, keepdims=True), rtol=1e-9)
+    np.testing.assert_array_equal(after.vote, before.vote)

@@ -51,7 +51,7 @@ def test_the_global_norm_is_clipped():
 
 @pytest.mark.parametrize("shape", [(288, 32), (20, 50), (3, 3, 8, 16)])
 def test_muon_moves_a_kernel_by_an_orthogonal_matrix_near_its_gradient(shape):
-    """Compares with the singular value decomposition G = U S V^T: the matrix is U V^T, and its root mean square 1."""
+    """Compares with U V^T of the singular value decomposition G = U S V^T, scaled to a root mean square of 0.4."""
     gradient = np.random.default_rng(0).standard_normal(shape)
     params = {"policy": {"kernel": jnp.zeros(shape), "bias": jnp.zeros(shape[-1])}, "rate": {"kernel": jnp.zeros(())}}
     optimizer = make_optimizer(OptimizerConfig(name="muon", learning_rate=3e-3), STEPS)
@@ -62,7 +62,7 @@ def test_muon_moves_a_kernel_by_an_orthogonal_matrix_near_its_gradient(shape):
     nearest = u @ v
     cosine = (moved * nearest).sum() / np.linalg.norm(moved) / np.linalg.norm(nearest)
     assert cosine > 0.98, "five steps of Newton and Schulz come near it"
-    assert np.sqrt(np.square(moved).mean()) == pytest.approx(3e-3, rel=0.25)
+    assert np.sqrt(np.square(moved).mean()) == pytest.approx(0.4 * 3e-3, rel=0.25)
     others = optax.nadam(3e-3)
     expected = float(others.update(jnp.ones(()), others.init(jnp.zeros(())))[0])
     np.testing.assert_allclose(update["policy"]["bias"], expected, rtol=1e-4)

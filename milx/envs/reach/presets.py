@@ -26,7 +26,7 @@ _FAST = (
         "train.redraw": True,
     }
 )
-_CPU = _FAST | {
+_SMALL = _FAST | {
     "env.image_shape": (32, 40),
     "data.tasks": 300,
     "data.demos_per_task": 5,
@@ -45,6 +45,13 @@ _CPU = _FAST | {
     "evaluation.baseline_trials": 1,
     "evaluation.batch": 25,
 }
+_CPU = _SMALL | {
+    "optimizer.name": "muon",
+    "method.sharpness": 4.0,
+    "train.steps": 6000,
+    "train.query_frames": 4,
+    "train.eval_every": 3000,
+}
 
 REACH: dict[str, Overrides] = {"paper": _PAPER, "fast": _FAST, "cpu": _CPU}
 REACH_DURATIONS = {
@@ -55,5 +62,5 @@ REACH_DURATIONS = {
 REACH_STATE: dict[str, Overrides] = {
     "paper": _PAPER | WITHOUT_PIXELS,
     "fast": _FAST | WITHOUT_PIXELS | {"network.fc_layers": (200, 200, 200), "train.steps": 20_000},
-    "cpu": _CPU | WITHOUT_PIXELS | {"train.meta_batch": 32},
+    "cpu": _SMALL | WITHOUT_PIXELS | {"train.meta_batch": 32},
 }
