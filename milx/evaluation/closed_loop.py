@@ -147,13 +147,26 @@ def listen(env: Env, method: Method, params: Params, demos: DemoSet, shots: int)
 
     Nothing where there are fewer than two tasks, or fewer tasks than devices.
     """
-    count = min(demos.num_tasks, _LISTENERS) // parallel.num_devices() * parallel.num_devices()
+    count = _listeners(demos.num_tasks)
     if count < 2:
         return {}
     chosen = jax.tree.map(lambda x: x[:count], demos)
     states = jax.tree.map(lambda x: x[:, : shots + 1], chosen.states)
-    chosen = dataclasses.replace(chosen, states=states, action=chosen.action[:, : shots + 1])
+    chosen = dataclasses.replace(
+        chosen, states=states, action=chosen.action[:, : shots + 1], success=chosen.success[:, : shots + 1]
+    )
     return {name: float(value) for name, value in _listen(env, method, params, chosen, shots).items()}
+
+
+def _listeners(num_tasks: int) -> int:
+    """Computes on how many of so many tasks to measure: equally many on each device."""
+    return min(num_tasks, _LISTENERS) // parallel.num_devices() * parallel.num_devices()
+
+
+def precompile_listen(env: Env, method: Method, params: Params, num_tasks: int, shots: int) -> None:
+    """Compiles what `listen` runs on so many tasks, into the compilation cache; `params` may be shapes."""
+    if (count := _listeners(num_tasks)) >= 2:
+        _listen.lower(env, method, params, shapes(env, count, shots + 1), shots).compile()
 
 
 class Baselines(NamedTuple):
@@ -211,6 +224,13 @@ def film(camera: Env, task: Task, states: State) -> jax.Array:
     `camera` is the environment with the wanted image size.
     """
     return jax.vmap(camera.film)(task, states)
+
+
+def precompile_film(camera: Env, num_tasks: int) -> None:
+    """Compiles what `film` runs for so many tasks, into the compilation cache."""
+    demos = shapes(camera, num_tasks, 1)
+    states = jax.tree.map(lambda x: jax.ShapeDtypeStruct((num_tasks, *x.shape[2:]), x.dtype), demos.states)
+    film.lower(camera, demos.task, states).compile()
 
 
 def summarize(

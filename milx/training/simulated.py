@@ -34,6 +34,8 @@ EVALUATION_SEED = 2017
 """Validation and test tasks and their trials are the same for every seed of a run."""
 VIDEO = "rollouts.gif"
 """The video's file in the run's folder."""
+_FILMED = 3
+"""Tasks that it shows."""
 
 
 def size_of_split(config: Config, split: str) -> tuple[int, int]:
@@ -180,6 +182,8 @@ class SimulatedRun(Run):
         return [
             *(functools.partial(precompile, self.method, params, config, first) for first in (None, *fewer)),
             functools.partial(precompile, random, {}, config, config.baseline_trials),
+            lambda: closed_loop.precompile_listen(self.env, self.method, params, config.validation_tasks, config.shots),
+            lambda: closed_loop.precompile_film(self._large, min(config.tasks, _FILMED)),
         ]
 
     def _validate(self, params: Params) -> tuple[float, dict[str, float]]:
@@ -202,11 +206,16 @@ class SimulatedRun(Run):
 
         return found | {"demonstrations": self._demonstrations}, draw
 
-    def _film(self, test: DemoSet, trials: Trials, num_tasks: int = 3) -> None:
-        """Writes the video: demonstrations beside the first trial of the same held-out tasks, in large."""
+    @functools.cached_property
+    def _large(self) -> envs.Env:
+        """The environment with images large enough to look at."""
         height, width = self.env.image_shape
         scale = max(1, 256 // height)
-        camera = envs.make(self.config.env_name, (scale * height, scale * width))
-        task, demo, trial = jax.tree.map(lambda x: x[:num_tasks], (test.task, test.states, trials.states))
-        clips = [closed_loop.film(camera, task, jax.tree.map(lambda x: x[:, 0], states)) for states in (demo, trial)]
-        plots.side_by_side(np.asarray(clips[0]), np.asarray(clips[1]), self.folder / VIDEO)
+        return envs.make(self.config.env_name, (scale * height, scale * width))
+
+    def _film(self, test: DemoSet, trials: Trials) -> None:
+        """Writes the video: demonstrations beside the first trial of the same held-out tasks, in large."""
+        task, demo, trial = jax.tree.map(lambda x: x[:_FILMED], (test.task, test.states, trials.states))
+        firsts = [jax.tree.map(lambda x: x[:, 0], states) for states in (demo, trial)]
+        left, right = (np.asarray(closed_loop.film(self._large, task, states)) for states in firsts)
+        plots.side_by_side(left, right, self.folder / VIDEO)

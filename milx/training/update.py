@@ -71,7 +71,7 @@ def _kernels(params: Params) -> Any:
     """Tells Muon how to read a kernel [..., F] as a matrix with F columns; None for all other parameters."""
 
     def read(path: tuple, x: jax.Array) -> optax.contrib.MuonDimensionNumbers | None:
-        if getattr(path[-1], "key", None) != "kernel" or x.ndim < 2:
+        if x.ndim < 2 or getattr(path[-1], "key", None) != "kernel":
             return None
         return optax.contrib.MuonDimensionNumbers(tuple(range(x.ndim - 1)), (x.ndim - 1,))
 

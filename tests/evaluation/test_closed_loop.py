@@ -12,8 +12,10 @@ from tiny import tiny_config
 
 from milx.config.schema import EvalConfig
 from milx.core.batching import map_in_chunks, map_in_groups
+from milx.envs.reach.env import Reach
 from milx.evaluation import closed_loop, intervals
 from milx.methods import Method
+from milx.methods.whitening import Whitening
 from milx.training import simulated
 
 # Wilson's interval of k successes in n trials, to four digits; by hand, 0/n ends at z^2 / (n + z^2).
@@ -172,6 +174,28 @@ def test_programs_compiled_ahead_are_found(trained, caplog):
         closed_loop.run_trials(trained.run.env, method, (), trained.test, config, jax.random.key(0))
         compiled.append("XLA compilation of jit(_run_batch)" in caplog.text)
     assert compiled == [True, False]
+
+
+def test_listening_and_filming_find_their_programs_compiled(trained, caplog):
+    """A method and an environment of its own: nothing of them is compiled yet."""
+    method, env, config = dataclasses.replace(trained.run.method), Reach((8, 10)), trained.config.evaluation
+    whitening = Whitening(*(jnp.full(n, v) for n in (8, 2) for v in (0.0, 1.0)))
+    params = method.init(jax.random.key(0), whitening)
+    first = jax.tree.map(lambda x: jnp.asarray(x[:, 0]), trained.validation.states)
+    compiled = []
+
+    def note():
+        compiled.append([f"XLA compilation of jit({name})" in caplog.text for name in ("_listen", "film")])
+        caplog.clear()
+
+    with jax.log_compiles():
+        closed_loop.precompile_listen(trained.run.env, method, params, 3, config.shots)
+        closed_loop.precompile_film(env, 3)
+        note()
+        closed_loop.listen(trained.run.env, method, params, trained.validation, config.shots)
+        closed_loop.film(env, trained.validation.task, first)
+        note()
+    assert compiled == [[True, True], [False, False]]
 
 
 def test_validation_and_test_trials_differ(trained):
