@@ -70,6 +70,7 @@ def test_first_code_cell_tells_how_to_install():
         assert re.search(r'^# %pip install "?milx', code(nbformat.read(path, as_version=4))[0].source, re.MULTILINE)
 
 
+@pytest.mark.slow
 def test_last_output_shows_the_demonstration_beside_another_rollout(executed):
     (output,) = code(executed)[-1].outputs
     frames = iio.imread(io.BytesIO(base64.b64decode(output.data["image/gif"])), extension=".gif", index=None)
@@ -85,6 +86,7 @@ def test_last_output_shows_the_demonstration_beside_another_rollout(executed):
         assert (np.abs(half[0] - half[-1]).max(axis=-1) > 40).sum() > 20
 
 
+@pytest.mark.slow
 def test_training_and_adaptation_did_something(executed):
     text = printed(executed)
     step, loss = re.search(r"^step (\d+), .*\bloss ([\d.e+-]+)", text, re.MULTILINE).groups()
@@ -98,6 +100,7 @@ def test_training_and_adaptation_did_something(executed):
     assert np.abs(actions["after adapting"] - actions["before adapting"]).max() > 1e-6
 
 
+@pytest.mark.slow
 def test_a_task_of_ones_own_is_planned_trained_and_judged(execute):
     notebook = execute("train_your_own_task", steps=4, tasks=2)
     found = re.search(r"success ([\d.]+)% of 20 trials; baselines and upper bound: (\{.*\})", printed(notebook))
@@ -109,6 +112,7 @@ def test_a_task_of_ones_own_is_planned_trained_and_judged(execute):
     assert (np.ptp(rows), np.ptp(columns)) == (4, 4), "the mark"
 
 
+@pytest.mark.slow
 def test_demonstrations_of_ones_own_are_learned_from(execute):
     """Compares policies adapted to a demonstration with those adapted to another task's."""
     text = printed(execute("bring_your_own_demonstrations", steps=400, tasks=0))

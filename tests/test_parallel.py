@@ -16,6 +16,7 @@ import sys
 import numpy as np
 import pytest
 
+pytestmark = pytest.mark.slow
 STEPS = 50
 
 

@@ -13,6 +13,7 @@ sys.path.insert(0, str(pathlib.Path(__file__).parents[2] / "experiments" / "pape
 import cells
 
 
+@pytest.mark.slow
 def test_a_cell_is_a_run(trained, tmp_path, monkeypatch):
     """Compares success, demonstrations and baselines to the last bit: same seeds, tasks and trials, killed or not."""
     monkeypatch.setattr(cells.envs, "make", lambda *_: trained.run.env)  # spares what is compiled for it

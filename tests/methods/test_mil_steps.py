@@ -45,6 +45,7 @@ def batch(float64):
     return random_batch()
 
 
+@pytest.mark.slow
 def test_a_video_teaches_the_goal_that_hindsight_sees_in_its_first_and_last_image(batch):
     """Makes one vote, theta, of deviation one: the inner gradient is the vote minus that goal, whatever the states are.
 

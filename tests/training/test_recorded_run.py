@@ -116,6 +116,7 @@ def test_whitening_is_fitted_to_the_training_tasks_alone(trained, folder):
         np.testing.assert_allclose(getattr(whitening, f"{field}_scale"), values.std(axis=0), rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_ends_bit_for_bit_like_the_uninterrupted_one(trained, folder, tmp_path, monkeypatch, capsys):
     """Interrupts a run, also one whose data passes by in shards, of which none is whole."""
     config = tiny_config(folder)

@@ -54,6 +54,7 @@ def same_run(trained, folder):
     return run
 
 
+@pytest.mark.slow
 def test_interrupted_run_ends_bit_for_bit_like_the_uninterrupted_one(trained, tmp_path, monkeypatch):
     write = MetricsWriter.write
 
