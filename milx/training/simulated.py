@@ -93,9 +93,8 @@ def result_of(
     env: envs.Env, method: Method, params: Params, demos: DemoSet, config: Config, baselines: closed_loop.Baselines
 ) -> tuple[Trials, dict[str, Any]]:
     """Evaluates on the test tasks: the trials, and what the result file says of them."""
-    trials = closed_loop.run_trials(env, method, params, demos, config.evaluation, trial_key("test"))
-    first = config.evaluation.baseline_trials
-    misled = closed_loop.run_trials(env, method, params, demos, config.evaluation, trial_key("test"), True, first)
+    run = functools.partial(closed_loop.run_trials, env, method, params, demos, config.evaluation, trial_key("test"))
+    trials, misled = run(), run(misled=True, first=config.evaluation.baseline_trials)
     return trials, closed_loop.summarize(env, config, demos.task, trials, misled, baselines)
 
 
