@@ -91,6 +91,21 @@ def test_an_episode_of_motion_is_that_of_mujoco_with_numpy(env, task):
     assert at_limit
 
 
+def test_the_planner_s_step_differs_from_the_exact_one_by_its_second_order(env, task):
+    """Checks the step of Euler's method: with half the action, a quarter of the difference is left."""
+    start = env.reset(jax.random.key(1), task)
+    actions = np.random.default_rng(2).uniform(-1, 1, (20, 6))
+
+    @jax.jit
+    @jax.vmap
+    def difference(action):
+        return env.approximate_step(task, start, action).qpos - env.step(task, start, action).qpos
+
+    whole, eighth, sixteenth = (np.linalg.norm(difference(actions / n), axis=-1) for n in (1, 8, 16))
+    assert 1e-3 < whole.min() and whole.max() < 0.05, "radians"
+    np.testing.assert_allclose(sixteenth / eighth, 1 / 4, rtol=0.05)
+
+
 def test_what_is_planned_is_what_its_version_says(env, task):
     """Compares tasks, scenes, guesses, physics and costs; the planner itself is in the test of reach's experts."""
 
@@ -99,9 +114,10 @@ def test_what_is_planned_is_what_its_version_says(env, task):
         start = env.reset(key, task)
         guess = env.guess(task, start)
         after = env.step(task, start, guess[0])
+        approximately = env.approximate_step(task, start, jnp.linspace(-1, 1, 6))
         costs = env.running_residual(task, after, guess[1], jnp.int32(1)), env.terminal_residual(task, after)
         fallen, _ = env.falls(task, after)
-        return task, start, guess[::10], after, costs, fallen
+        return task, start, guess[::10], after, approximately, costs, fallen
 
     numbers = [np.ravel(x).astype(float) for x in jax.tree.leaves(look(task, jax.random.key(1)))]
     planned.check("place", [env.version, VERSION], np.concatenate(numbers), atol=1e-5)

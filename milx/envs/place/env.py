@@ -89,6 +89,7 @@ class Place(Env[PlaceTask]):
     criterion = "the thing comes to rest in or on the target container once the hand has opened"
     state_size = 16
     goal_indices = (7, 8)
+    version = 2
 
     def __init__(self, image_shape: tuple[int, int] | None = None):
         super().__init__(_build(), image_shape)
@@ -166,14 +167,22 @@ class Place(Env[PlaceTask]):
 
     def integrate(self, model: mjx.Model, state: State, ctrl: jax.Array) -> jax.Array:
         """Moves the joints for one time step so that the hand moves as `ctrl` asks."""
-        _, _, jacobian = self.hand(state.qpos)
+        return self._move(state.qpos, ctrl, self.mj_model.opt.timestep)
+
+    def approximate_step(self, task: PlaceTask, state: State, action: jax.Array) -> State:
+        """Takes one time step as long as the action instead of `substeps`."""
+        ctrl, duration = jnp.clip(action, *self.action_range), self.substeps * self.mj_model.opt.timestep
+        return state.with_vector(self._move(state.qpos, ctrl, duration))
+
+    def _move(self, qpos: jax.Array, ctrl: jax.Array, h: float) -> jax.Array:
+        """Takes an Euler step of `h` seconds and returns the next `state.vector`."""
+        _, _, jacobian = self.hand(qpos)
         wanted = ctrl * jnp.array([MAX_SPEED] * 3 + [MAX_TURN] * 3)
         normal = jacobian @ jacobian.T + _DAMPING**2 * jnp.eye(6)
         velocity = jacobian.T @ solve_free(normal, wanted, jnp.ones(6, bool))
         low, high = jnp.asarray(self.mj_model.jnt_range.T, float)
-        h = self.mj_model.opt.timestep
-        qpos = jnp.clip(state.qpos + h * velocity, low, high)
-        return jnp.concatenate([qpos, (qpos - state.qpos) / h])
+        after = jnp.clip(qpos + h * velocity, low, high)
+        return jnp.concatenate([after, (after - qpos) / h])
 
     @functools.partial(jax.jit, static_argnums=0)
     def model_of(self, task: PlaceTask) -> mjx.Model:
