@@ -9,16 +9,17 @@ import jax.numpy as jnp
 from milx.core import parallel, progress
 
 
-def map_in_chunks(function: Callable[..., Any], inputs: tuple, size: int) -> Any:
+def map_in_chunks(function: Callable[..., Any], inputs: tuple, size: int, counted: bool = True) -> Any:
     """Calls `function(*inputs)` on slices of the leading axis and joins the results.
 
     All calls have the same size, so the function is compiled only once. The last slice is filled up by repeating the
-    last entry. After each call the entries count as done in `milx.core.progress`.
+    last entry.
 
     Args:
         function: maps pytrees with leading axis [size] to a pytree with leading axis [size].
         inputs: pytrees with leading axis [M].
         size: number of entries in one call. It is rounded up to a multiple of the number of devices.
+        counted: whether the entries count as done in `milx.core.progress` after each call.
 
     Returns:
         The results, with leading axis [M].
@@ -28,7 +29,8 @@ def map_in_chunks(function: Callable[..., Any], inputs: tuple, size: int) -> Any
     for start in range(0, total, size):
         index = jnp.minimum(jnp.arange(start, start + size), total - 1)
         result = jax.block_until_ready(function(*jax.tree.map(lambda x, index=index: x[index], inputs)))
-        progress.advance(size)
+        if counted:
+            progress.advance(size)
         results.append(jax.tree.map(lambda x, start=start: x[: total - start], result))
     return jax.tree.map(lambda *xs: jnp.concatenate(xs), *results)
 

@@ -20,7 +20,7 @@ from milx.core.batching import map_in_chunks
 from milx.data.goals import goals
 from milx.envs.base import Env, State, Task
 from milx.trajopt import expert
-from milx.trajopt.expert import judge, perform
+from milx.trajopt.expert import choose_tactics, judge, perform
 from milx.trajopt.ilqr import Options
 from milx.types import SPLITS, Demo, TaskBatch
 
@@ -74,18 +74,19 @@ def collect(
         parts: how the names of files begin that keep what is planned at once, so that a process that was killed goes on
             with the next; None for no files.
     """
-    tasks, *inputs = _draw(env, jax.random.fold_in(key, SPLITS.index(split)), split, num_tasks, num_demos)
+    tasks, each, state, keys = _draw(env, jax.random.fold_in(key, SPLITS.index(split)), split, num_tasks, num_demos)
     options, numbers = Options(iterations=config.plan_iterations), itertools.count()
+    tactic = None if options.iterations else choose_tactics(env, each, state, config.plan_batch)
 
-    def plan_part(task: Task, state: State, key: jax.Array) -> tuple[State, jax.Array]:
-        make = functools.partial(perform, env, task, state, key, options, config.noise)
+    def plan_part(task: Task, state: State, key: jax.Array, tactic: Any) -> tuple[State, jax.Array]:
+        make = functools.partial(perform, env, task, state, key, options, config.noise, tactic)
         if parts is None:
             return make()
         path = parts.with_name(f"{parts.name}-{next(numbers)}.npz")
         return pytrees.kept(path, make, lambda: _of_one_task(shapes(env, 1, len(key))))
 
-    states, action = map_in_chunks(plan_part, tuple(inputs), config.plan_batch)
-    success, _ = map_in_chunks(functools.partial(judge, env), (inputs[0], states), config.plan_batch)
+    states, action = map_in_chunks(plan_part, (each, state, keys, tactic), config.plan_batch)
+    success, _ = map_in_chunks(functools.partial(judge, env), (each, states), config.plan_batch)
     states, action, success = _without_diverged(states, action, success)
     states, action, success = jax.tree.map(
         lambda x: x.reshape(num_tasks, num_demos, *x.shape[1:]), (states, action, success)

@@ -22,7 +22,7 @@ from milx.evaluation.intervals import bootstrap_interval, wilson_interval
 from milx.evaluation.rollout import rollout
 from milx.methods.base import Method
 from milx.methods.random import Random
-from milx.trajopt.expert import judge, perform
+from milx.trajopt.expert import choose_tactics, judge, perform
 from milx.trajopt.ilqr import Options
 from milx.types import Demo, Params, TaskBatch, TaskParams
 
@@ -198,10 +198,16 @@ def evaluate_baselines(env: Env, demos: DemoSet, config: EvalConfig, expert: Dat
 
     # Both experts plan for the task as they believe it to be, and both are judged by the task as it is.
     believed = jax.vmap(env.task_blind)(keys, task), task
-    twice = [jax.tree.map(lambda *xs: jnp.concatenate(xs), *pair) for pair in (believed, (scene, scene), (keys, keys))]
+    tasks, scenes, keys = (
+        jax.tree.map(lambda *xs: jnp.concatenate(xs), *pair) for pair in (believed, (scene, scene), (keys, keys))
+    )
     options = Options(iterations=expert.plan_iterations)
-    plan = functools.partial(perform, env, options=options, noise=0.0)
-    states, _ = map_in_chunks(plan, tuple(twice), expert.plan_batch)
+    tactic = None if options.iterations else choose_tactics(env, tasks, scenes, expert.plan_batch)
+
+    def plan(task: Task, state: State, key: jax.Array, tactic: Any) -> tuple[State, jax.Array]:
+        return perform(env, task, state, key, options, 0.0, tactic)
+
+    states, _ = map_in_chunks(plan, (tasks, scenes, keys, tactic), expert.plan_batch)
     as_it_is = jax.tree.map(lambda x: jnp.concatenate([x, x]), task)
     success, other = map_in_chunks(functools.partial(judge, env), (as_it_is, states), expert.plan_batch)
     random = run_trials(env, Random(env.action_size), {}, demos, config, key, first=num_trials)

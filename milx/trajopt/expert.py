@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from milx.core import parallel
+from milx.core.batching import map_in_chunks
 from milx.envs.base import Env, State, Task
 from milx.trajopt.ilqr import Options, Plan, Problem, solve
 
@@ -75,7 +76,13 @@ def demonstrate(
 
 
 def perform(
-    env: Env, task: Task, state: State, key: jax.Array, options: Options, noise: float
+    env: Env,
+    task: Task,
+    state: State,
+    key: jax.Array,
+    options: Options,
+    noise: float,
+    tactic: np.ndarray | None = None,
 ) -> tuple[State, jax.Array]:
     """Demonstrates a batch, as planned by iLQR or by the environment's controller. Not to be called inside `jax.jit`.
 
@@ -86,6 +93,7 @@ def perform(
         key: [N] draw the noise.
         options: of iLQR; with no iterations the controller acts.
         noise: standard deviation of the noise, in units of the action.
+        tactic: [N], the tactics of the controller; None for those that `choose_tactics` finds.
 
     Returns:
         As `demonstrate`, with a leading axis [N].
@@ -95,22 +103,33 @@ def perform(
     """
     if options.iterations:
         return _perform_planned(env, options, noise, task, state, key)
-    return _perform_controlled(env, noise, task, state, choose_tactics(env, task, state), key)
+    if tactic is None:
+        tactic = choose_tactics(env, task, state, len(key))
+    return _perform_controlled(env, noise, task, state, tactic, key)
 
 
-def choose_tactics(env: Env, task: Task, state: State) -> np.ndarray:
+def choose_tactics(env: Env, task: Task, state: State, batch: int) -> np.ndarray:
     """Finds, for each of N scenes, the first tactic [N] with which the controller succeeds without noise.
 
-    Where no tactic succeeds it is the first of all.
+    Where no tactic succeeds it is the first of all. Only scenes in which the tactics before have failed rehearse the
+    next one. `batch` scenes rehearse at once.
     """
-    scenes = len(state.qpos)
-    every = [np.full(scenes, tactic) for tactic in env.tactics]
-    if len(every) == 1:
-        return every[0]
-    keys = jax.random.split(jax.random.key(0), scenes)  # of noise that is multiplied by zero
-    rehearsals = (_perform_controlled(env, 0.0, task, state, each, keys)[0] for each in every)
-    success = [np.asarray(judge(env, task, states)[0]) for states in rehearsals]
-    return np.array(env.tactics)[np.argmax(success, axis=0)]
+    chosen = np.full(len(state.qpos), env.tactics[0])
+    unsolved = np.arange(len(chosen)) if len(env.tactics) > 1 else np.array([], int)
+
+    def rehearse(tactic: float, task: Task, state: State) -> jax.Array:
+        count = len(state.qpos)
+        keys = jax.random.split(jax.random.key(0), count)  # of noise that is multiplied by zero
+        states, _ = _perform_controlled(env, 0.0, task, state, np.full(count, tactic), keys)
+        return judge(env, task, states)[0]
+
+    for tactic in env.tactics:
+        if len(unsolved):
+            scenes = jax.tree.map(lambda x, index=unsolved: x[index], (task, state))
+            success = np.asarray(map_in_chunks(functools.partial(rehearse, tactic), scenes, batch, counted=False))
+            chosen[unsolved[success]] = tactic
+            unsolved = unsolved[~success]
+    return chosen
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))

@@ -157,7 +157,7 @@ def test_demonstrations_that_diverge_are_dropped_and_counted(trained, monkeypatc
     """Plans eight demonstrations, of which the third leaves the world and the fifth loses an action."""
     env, config = trained.run.env, dataclasses.replace(trained.config.data, plan_batch=8)
 
-    def diverge(env, task, state, key, options, noise):
+    def diverge(env, task, state, key, options, noise, tactic):
         states = jax.tree.map(lambda x: jnp.repeat(x[:, None], env.horizon + 1, axis=1), state)
         qpos = states.qpos.at[2, 30].set(jnp.inf)
         return dataclasses.replace(states, qpos=qpos), jnp.ones((8, env.horizon, 2)).at[4, 7, 1].set(jnp.nan)

@@ -223,7 +223,8 @@ class Push(Env[PushTask]):
         """Returns [7], what `controller.torque` does in one state, `tactic` (m) to the side of the object's center."""
         target = task.target
         x, y, turn = self.objects(state)[target]
-        pose, jacobian = self.hand(state.qpos), jax.jacfwd(self.hand)(state.qpos)[:, :NUM_JOINTS]
+        moved = lambda joints: self.hand(state.qpos.at[:NUM_JOINTS].set(joints))  # noqa: E731
+        pose, jacobian = self.hand(state.qpos), jax.jacfwd(moved)(state.qpos[:NUM_JOINTS])
         place = jnp.stack([x, y])
         ahead = -place / jnp.maximum(jnp.linalg.norm(place), 0.02)
         cos, sin = jnp.cos(turn), jnp.sin(turn)
