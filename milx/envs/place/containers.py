@@ -8,6 +8,7 @@ What is held out is a kind of container, not another size of one that was traine
 """
 
 import dataclasses
+import functools
 import itertools
 from typing import NamedTuple
 
@@ -142,8 +143,9 @@ class Geoms(NamedTuple):
     height: float
 
 
+@functools.cache
 def to_geoms(container: Container) -> Geoms:
-    """Builds the geoms of a container.
+    """Builds the geoms of a container; they are shared and not to be changed.
 
     Raises:
         ValueError: for a number of sides or handles that there are no geoms for.

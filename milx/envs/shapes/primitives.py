@@ -8,6 +8,7 @@ Every task has the same geoms (SLOTS): what a shape does not use is hidden.
 """
 
 import dataclasses
+import functools
 import itertools
 from typing import NamedTuple
 
@@ -156,8 +157,9 @@ class Geoms(NamedTuple):
     radius: np.ndarray
 
 
+@functools.cache
 def to_geoms(shape: Shape) -> Geoms:
-    """Builds the geoms of a shape, centered and scaled."""
+    """Builds the geoms of a shape, centered and scaled; they are shared and not to be changed."""
     center, squared_gyration, unit = _outline(shape.capsules)
     kinds: tuple[tuple, ...] = (shape.capsules, shape.ellipsoids, shape.boxes, shape.cylinders)
     rows: list[tuple[list[float], list[float], list[float], bool, bool]] = []
