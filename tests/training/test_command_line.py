@@ -1,17 +1,46 @@
 """The command line: help, and bad input that ends with a message instead of a traceback."""
 
+import multiprocessing
+import os
+import pathlib
 import re
+import runpy
 import subprocess
 import sys
+import types
 
 import pytest
 
 
-def train(folder, *arguments):
-    """Runs `python -m milx.train` in `folder`."""
-    return subprocess.run(
-        [sys.executable, "-m", "milx.train", *arguments], cwd=folder, capture_output=True, text=True, timeout=120
-    )
+def main(folder, arguments):
+    """Does in this process what `python -m milx.train` does in a new one, with its output in files."""
+    os.chdir(folder)
+    for stream, name in ((1, "stdout"), (2, "stderr")):
+        os.dup2(os.open(f"{folder}.{name}", os.O_WRONLY | os.O_CREAT | os.O_TRUNC), stream)
+    sys.argv = ["milx.train", *arguments]
+    runpy.run_module("milx.train", run_name="__main__", alter_sys=True)
+
+
+@pytest.fixture(scope="module")
+def forks():
+    """Imports milx once, in a process of which those that run the command line are forks."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["milx.training.factory"])
+    return context
+
+
+@pytest.fixture
+def train(forks, tmp_path):
+    """Returns a function that runs the command line in `tmp_path`."""
+
+    def run(*arguments):
+        process = forks.Process(target=main, args=(tmp_path, arguments))
+        process.start()
+        process.join(120)
+        stdout, stderr = (pathlib.Path(f"{tmp_path}.{name}").read_text() for name in ("stdout", "stderr"))
+        return types.SimpleNamespace(returncode=process.exitcode, stdout=stdout, stderr=stderr)
+
+    return run
 
 
 @pytest.mark.parametrize(
@@ -23,8 +52,8 @@ def train(folder, *arguments):
         ("--config.train.nope=1", "--config.train.nope: no such field", ["train.steps", "method.inner_lr", "seed"]),
     ],
 )
-def test_bad_input_ends_with_a_message_that_lists_what_is_valid(tmp_path, argument, message, valid):
-    process = train(tmp_path, argument)
+def test_bad_input_ends_with_a_message_that_lists_what_is_valid(train, tmp_path, argument, message, valid):
+    process = train(argument)
     said = process.stdout + process.stderr
     assert process.returncode != 0
     assert message in said
@@ -45,28 +74,28 @@ def test_bad_input_ends_with_a_message_that_lists_what_is_valid(tmp_path, argume
         ),
     ],
 )
-def test_flags_that_do_not_belong_together_end_with_a_message(tmp_path, argument, message):
-    process = train(tmp_path, argument)
+def test_flags_that_do_not_belong_together_end_with_a_message(train, argument, message):
+    process = train(argument)
     assert process.returncode != 0
     assert message in process.stderr and "Traceback" not in process.stderr
 
 
-def test_the_first_line_says_what_is_done_and_how_long_it_took(tmp_path):
+def test_the_first_line_says_what_is_done_and_how_long_it_took(train, tmp_path):
     (tmp_path / "run").write_text("a file, so that no run begins")
-    said = train(tmp_path, "--env=reach", "--preset=cpu", "--seed=3", "--workdir=run").stdout.splitlines()[0]
+    said = train("--env=reach", "--preset=cpu", "--seed=3", "--workdir=run").stdout.splitlines()[0]
     assert re.match(
         r"milx: mil on reach, preset cpu, seed 3, with \d+ CPU cores, in run\. This took [\d.]+ minutes on", said
     )
-    said = train(tmp_path, "--method=lstm", "--workdir=run").stdout
+    said = train("--method=lstm", "--workdir=run").stdout
     assert said.startswith("milx: lstm on reach, preset cpu, seed 0") and "--preset=paper, --preset=fast" in said
     assert "This took" not in said, "that was measured for MIL"
 
 
-def test_a_method_has_no_settings_of_another(tmp_path):
-    said = train(tmp_path, "--method=lstm", "--config.method.inner_steps=7").stderr
+def test_a_method_has_no_settings_of_another(train):
+    said = train("--method=lstm", "--config.method.inner_steps=7").stderr
     assert "--config.method.inner_steps: no such field with --method=lstm, expected one of" in said
     assert "method.given" in said and "network.context_frames" in said and "network.heads" not in said
-    said = train(tmp_path, "--env=reach_state", "--method=lstm_attention", "--config.network.filters=(4,)").stderr
+    said = train("--env=reach_state", "--method=lstm_attention", "--config.network.filters=(4,)").stderr
     assert "--config.network.filters: no such field with --method=lstm_attention, expected one of" in said
     assert "network.fc_layers" in said and "network.kernel" not in said
 
@@ -87,25 +116,30 @@ def test_a_package_of_ones_own_is_found(tmp_path, monkeypatch):
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: mine\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text("[milx.plugins]\nmine = mine\n")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    said = train(tmp_path, "--env=my_env", "--method=my_method", "--config.train.nope=1").stderr
+
+    def train(*arguments):
+        command = [sys.executable, "-m", "milx.train", *arguments]
+        return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+
+    said = train("--env=my_env", "--method=my_method", "--config.train.nope=1").stderr
     assert "--config.train.nope: no such field with --method=my_method" in said
 
     (tmp_path / "mine.py").write_text("import milx\nmilx.no_such_function()\n")
-    said = train(tmp_path, "--env=nope").stderr
+    said = train("--env=nope").stderr
     assert "plugin mine = mine: AttributeError" in said, "a broken package is named"
     assert "env: got 'nope'" in said, "and milx goes on without it"
 
 
-def test_value_of_another_type_ends_with_a_message(tmp_path):
-    process = train(tmp_path, "--config.train.steps=many")
+def test_value_of_another_type_ends_with_a_message(train):
+    process = train("--config.train.steps=many")
     said = process.stdout + process.stderr
     assert process.returncode != 0
     assert "Traceback" not in said
     assert "train.steps" in said and "many" in said
 
 
-def test_help_shows_the_flags_and_their_choices(tmp_path):
-    said = train(tmp_path, "--help").stdout
+def test_help_shows_the_flags_and_their_choices(train):
+    said = train("--help").stdout
     for flag in ("env", "method", "preset", "seed", "workdir"):
         assert re.search(rf"^\s*--(\[no\])?{flag}:", said, re.MULTILINE), flag
     assert "--config.path.to.field=value" in re.sub(r"\s+", "", said)
