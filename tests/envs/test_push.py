@@ -147,9 +147,9 @@ def test_a_tactic_is_how_far_to_the_side_of_the_objects_center_the_hand_meets_it
 
 def test_demonstrations_record_the_controllers_answers_before_the_noise(env, shown):
     tasks, states, action = shown
-    before = jax.tree.map(lambda x: x[:, :-1], states)
     answers = jax.jit(jax.vmap(jax.vmap(jax.vmap(env.control, (None, None, 0)), (None, 0, None)), (0, 0, None)))
-    off = np.abs(answers(tasks, before, jnp.array(env.tactics)) - action[:, :, None]).max(axis=(1, 3))
+    few, before = jax.tree.map(lambda x: x[:8], tasks), jax.tree.map(lambda x: x[:8, :-1], states)
+    off = np.abs(answers(few, before, jnp.array(env.tactics)) - action[:8, :, None]).max(axis=(1, 3))
     assert off.min(axis=1).max() < 1e-9, "one and the same tactic all the time"
     scenes, keys = scenes_of(env, tasks)
     quiet, quiet_action = perform(env, tasks, scenes, keys, Options(iterations=0), 0.0)
