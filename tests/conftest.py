@@ -1,6 +1,7 @@
 """One tiny run, planned, trained and evaluated once; tests of its parts look at what it left."""
 
 import dataclasses
+import gc
 import json
 import os
 import pathlib
@@ -17,8 +18,13 @@ from milx.data.simulated import DemoSet
 from milx.training.simulated import SimulatedRun
 
 milx.configure()
-# Compiling takes longer than running here.
-os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=1"
+# Compiling takes longer than running here. Programs of one operation are not worth a file in the cache.
+_FLAGS = ("backend_optimization_level=0", "llvm_disable_expensive_passes=true", "cpu_parallel_codegen_split_count=1")
+os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *(f"--xla_{flag}" for flag in _FLAGS)])
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.05)
+# Tracing makes very many objects: a collection after every 700 of them would find little to free.
+gc.freeze()
+gc.set_threshold(50_000)
 
 
 @dataclasses.dataclass(frozen=True)
