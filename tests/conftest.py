@@ -75,6 +75,7 @@ def trained(cache, shared) -> Trained:
     with filelock.FileLock(shared / "run.lock"):
         run = SimulatedRun(tiny_config(), shared / "run", QUIET)
         if not (run.folder / "evaluation.json").is_file():
+            run._large = run.env  # a video of large images takes longer to draw than to compile
             run.train()
             run.evaluate()
     result = json.loads((run.folder / "evaluation.json").read_text())
