@@ -14,6 +14,7 @@ from milx.core.linear_algebra import solve_free
 from milx.core.mjx import mjx
 from milx.envs import shapes
 from milx.envs.base import ASSETS, OUT_OF_THE_WAY, Env, State, check_split
+from milx.envs.chain import Chain, Pose
 from milx.envs.place import containers, drop
 from milx.envs.place.containers import CONTAINERS
 from milx.envs.place.drop import Fall
@@ -95,7 +96,7 @@ class Place(Env[PlaceTask]):
         super().__init__(_build(), image_shape)
         model = self.mj_model
         self._rgba = jnp.asarray(model.geom_rgba, float)
-        self._tip, self._hand = model.site("tip").id, model.body("hand").id
+        self._arm, self._hand = Chain(model, "tip"), model.body("hand").id
         self._body = np.array([model.body(name).id for name in ("thing", *_container_names())])
         self._geom = [model.body_geomadr[body] + np.arange(model.body_geomnum[body]) for body in self._body]
         stack = lambda geoms: jax.tree.map(lambda *x: jnp.asarray(np.array(x)), *geoms)  # noqa: E731
@@ -158,12 +159,9 @@ class Place(Env[PlaceTask]):
         return dataclasses.replace(states, mocap_pos=states.mocap_pos.at[..., :2].set(place))
 
     @functools.partial(jax.jit, static_argnums=0)
-    def hand(self, qpos: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Returns the tip's position [3] (m), the hand's axes [3, 3] as columns, and its motion's Jacobian [6, 7]."""
-        data = mjx.kinematics(self.model, self._data.replace(qpos=qpos))
-        tip, axis = data.site_xpos[self._tip], data.xaxis[:NUM_JOINTS]
-        lever = jnp.cross(axis, tip - data.xanchor[:NUM_JOINTS])
-        return tip, data.xmat[self._hand].reshape(3, 3), jnp.concatenate([lever, axis], axis=1).T
+    def hand(self, qpos: jax.Array) -> Pose:
+        """Returns the pose of the hand's tip at joints [7]."""
+        return self._arm.pose(qpos)
 
     def integrate(self, model: mjx.Model, state: State, ctrl: jax.Array) -> jax.Array:
         """Moves the joints for one time step so that the hand moves as `ctrl` asks."""

@@ -10,6 +10,7 @@ import numpy as np
 
 from milx.core.mjx import mjx
 from milx.envs.base import ASSETS, OUT_OF_THE_WAY, Env, State, check_split
+from milx.envs.chain import Chain
 from milx.envs.push import controller
 from milx.envs.shapes import BY_SPLIT, SHAPES
 from milx.envs.shapes.primitives import NUM_CAPSULES, SLOTS, Geoms, to_geoms
@@ -94,7 +95,7 @@ class Push(Env[PushTask]):
         model = self.mj_model
         self._rgba = jnp.asarray(model.geom_rgba, float)
         self._prong = float(model.geom("prong_middle").size[0])
-        self._tip, self._hand = model.site("tip").id, model.body("hand").id
+        self._arm = Chain(model, "tip")
         self._body = np.array([model.body(name).id for name in _OBJECTS])
         self._dof = np.array([model.jnt_dofadr[model.body_jntadr[body]] + np.arange(3) for body in self._body])
         self._geom = np.array([model.body_geomadr[body] + np.arange(model.body_geomnum[body]) for body in self._body])
@@ -190,10 +191,9 @@ class Push(Env[PushTask]):
 
     @functools.partial(jax.jit, static_argnums=0)
     def hand(self, qpos: jax.Array) -> jax.Array:
-        """Returns [9]: tip position (m) and unit vectors of the hand's pushing and of its prongs, at joints [13]."""
-        data = mjx.kinematics(self.model, self._data.replace(qpos=qpos))
-        pose = data.xmat[self._hand].reshape(3, 3)
-        return jnp.concatenate([data.site_xpos[self._tip], pose[:, 2], pose[:, 0]])
+        """Returns [9]: tip position (m), unit vectors of the hand pushing and of its prongs, at joints [7, ...]."""
+        tip, axes, _ = self._arm.pose(qpos[:NUM_JOINTS])
+        return jnp.concatenate([tip, axes[:, 2], axes[:, 0]])
 
     def robot_state(self, state: State) -> jax.Array:
         """Returns [20] joint angles, joint velocities, tip position, and direction of pushing."""
@@ -223,8 +223,7 @@ class Push(Env[PushTask]):
         """Returns [7], what `controller.torque` does in one state, `tactic` (m) to the side of the object's center."""
         target = task.target
         x, y, turn = self.objects(state)[target]
-        moved = lambda joints: self.hand(state.qpos.at[:NUM_JOINTS].set(joints))  # noqa: E731
-        pose, jacobian = self.hand(state.qpos), jax.jacfwd(moved)(state.qpos[:NUM_JOINTS])
+        pose, jacobian = self.hand(state.qpos), jax.jacfwd(self.hand)(state.qpos[:NUM_JOINTS])
         place = jnp.stack([x, y])
         ahead = -place / jnp.maximum(jnp.linalg.norm(place), 0.02)
         cos, sin = jnp.cos(turn), jnp.sin(turn)
