@@ -2,7 +2,7 @@
 
     python -m milx.collect --env=reach --workdir=demos --config.data.tasks=100
 
-Each file holds the tasks, the states, the actions and whether each demonstration succeeds; `milx.core.pytrees.load`
+Each file holds the tasks, the states, the actions and whether each demonstration succeeds; `milx.core.pytrees.read`
 reads it.
 """
 
@@ -24,7 +24,7 @@ def main(config: Config, workdir: str) -> None:
     for split in SPLITS:
         demos = demos_of_split(env, config, split)
         path = pathlib.Path(workdir) / f"{split}.npz"
-        pytrees.save(path, demos)
+        pytrees.write(path, demos)
         print(f"{path}: {demos.num_tasks} tasks x {demos.num_demos}, {float(demos.success.mean()):.1%} succeed")
 
 

@@ -8,7 +8,6 @@ import sys
 
 from absl import app, flags, logging
 
-from milx.config.registry import load_plugins
 from milx.core import platform
 from milx.deploy.export import export
 from milx.deploy.pretrained import load
@@ -20,7 +19,6 @@ def main(argv: list[str]) -> None:
         raise app.UsageError("expected two arguments, RUN and OUT")
     logging.set_verbosity(logging.WARNING)
     platform.configure()
-    load_plugins()
     try:
         export(load(argv[1]), argv[2], flags.FLAGS.shots)
     except (ValueError, OSError) as error:

@@ -212,7 +212,7 @@ def test_headers_of_data_sets(data_set, data):
 
     def read():
         opened = DataSet(folder)
-        recorded.make_config(folder, preset="cpu")
+        recorded.config_for(folder, preset="cpu")
         return [opened.read(i, j) for i, task in enumerate(opened.header.tasks) for j in range(len(task.lengths))]
 
     demos = accepted(read)

@@ -103,7 +103,7 @@ def run(data, folder):
 
     from milx.training import recorded
 
-    config = recorded.make_config(data, preset="cpu")
+    config = recorded.config_for(data, preset="cpu")
     config.recorded.horizon, config.network.fc_layers = 9, (32,)
     config.train.steps, config.train.log_every, config.train.eval_every = 40, 10, 20
     run = recorded.RecordedRun(config, folder, QUIET)

@@ -94,11 +94,11 @@ def shard_tasks(function: Callable[..., Any], *, shared: int = 0, average: bool 
         result = function(*args)
         return jax.lax.pmean(result, AXIS) if average else result
 
-    everywhere, split = PartitionSpec(), PartitionSpec(AXIS)
+    everywhere, sharded = PartitionSpec(), PartitionSpec(AXIS)
 
     def call(*args: Any) -> Any:
-        specs = tuple(everywhere if i < shared else split for i in range(len(args)))
-        out = everywhere if average else split
+        specs = tuple(everywhere if i < shared else sharded for i in range(len(args)))
+        out = everywhere if average else sharded
         # Scans in milx start from constants, which the check of varying axes (check_vma) would reject.
         result = jax.shard_map(on_each, mesh=mesh(), in_specs=specs, out_specs=out, check_vma=False)(*args)
         return jax.lax.with_sharding_constraint(result, NamedSharding(mesh(), everywhere))

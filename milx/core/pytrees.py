@@ -31,7 +31,7 @@ def fingerprint(tree: Any) -> str:
     return digest.hexdigest()
 
 
-def save(path: pathlib.Path, tree: Any) -> None:
+def write(path: pathlib.Path, tree: Any) -> None:
     """Writes a pytree as one .npz file; an existing file is replaced only when the new one is complete."""
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_suffix(f".partial{os.getpid()}.npz")
@@ -40,7 +40,7 @@ def save(path: pathlib.Path, tree: Any) -> None:
     partial.replace(path)
 
 
-def load(path: pathlib.Path, like: Any) -> Any:
+def read(path: pathlib.Path, like: Any) -> Any:
     """Reads a pytree written by `save`.
 
     Args:
@@ -77,9 +77,9 @@ def kept(path: pathlib.Path, make: Callable[[], Any], like: Callable[[], Any]) -
     """
     if parallel.on_all_hosts(path.is_file()):
         try:
-            return load(path, like())
+            return read(path, like())
         except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
             print(f"milx: {path} is damaged and made again: {error}", file=sys.stderr)
     tree = make()
-    save(path, tree)
+    write(path, tree)
     return tree

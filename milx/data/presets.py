@@ -4,7 +4,7 @@ from milx.config.registry import Overrides
 from milx.envs.push.presets import PUSH
 
 _FAST = PUSH["fast"] | {"train.steps": 10_000, "train.eval_every": 1000, "train.redraw": False}
-PRESETS: dict[str, Overrides] = {
+RECORDED_PRESETS: dict[str, Overrides] = {
     "fast": _FAST,
     "cpu": _FAST
     | {

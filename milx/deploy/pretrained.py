@@ -6,6 +6,7 @@ from typing import Any
 
 from milx import envs, methods
 from milx.config import assemble
+from milx.config.registry import load_plugins
 from milx.core import pytrees
 from milx.deploy import policy
 from milx.deploy.policy import Policy
@@ -33,6 +34,7 @@ def load(run: str | pathlib.Path) -> Policy:
     Raises:
         ValueError: if it is neither, or if the run has no checkpoint yet.
     """
+    load_plugins()  # a run may be of another package's method or environment
     is_run = (pathlib.Path(run) / "config.json").is_file()
     if is_run or (pathlib.Path(run).exists() and run not in names()):
         return policy.load_run(run)
@@ -42,7 +44,7 @@ def load(run: str | pathlib.Path) -> Policy:
     config = assemble.from_dict(result(str(run))["config"])
     spec = envs.make(config.env_name, config.env.image_shape, config.env.action_cost).spec
     method = methods.make(config, spec)
-    params = pytrees.load(FOLDER / run / "params.npz", like=params_like(method, spec))
+    params = pytrees.read(FOLDER / run / "params.npz", like=params_like(method, spec))
     return Policy(method, spec, params, config)
 
 
@@ -54,6 +56,6 @@ def save(trained: Policy, reached: dict[str, Any], folder: pathlib.Path) -> None
         reached: the contents of the run's evaluation.json, with the configuration.
         folder: the folder to write to.
     """
-    pytrees.save(folder / "params.npz", trained.params)
+    pytrees.write(folder / "params.npz", trained.params)
     digest = pytrees.fingerprint(trained.params)
     (folder / "result.json").write_text(json.dumps(reached | {"params_hash": digest}, indent=1) + "\n")

@@ -3,7 +3,6 @@
 import dataclasses
 from typing import Any
 
-import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
@@ -89,13 +88,15 @@ class ContextPolicy(Method):
 def make_contextual(config: Config, spec: Spec) -> ContextPolicy:
     """Builds the policy that sees a demonstration's last frame."""
     assert isinstance(config.network, ContextConfig)
-    return _with_context(config, spec, LastFrame(config.network), _actor(config.network, spec))
+    network = make_context_network(LastFrame(config.network), _actor(config.network, spec), spec)
+    return _with_context(config, spec, network)
 
 
 def make_lstm(config: Config, spec: Spec) -> ContextPolicy:
     """Builds the policy whose LSTM reads a demonstration."""
     assert isinstance(config.network, RecurrentConfig)
-    return _with_context(config, spec, Recurrent(config.network), _actor(config.network, spec))
+    network = make_context_network(Recurrent(config.network), _actor(config.network, spec), spec)
+    return _with_context(config, spec, network)
 
 
 def make_lstm_attention(config: Config, spec: Spec) -> ContextPolicy:
@@ -109,13 +110,13 @@ def make_lstm_attention(config: Config, spec: Spec) -> ContextPolicy:
         expected = "another: the state does not tell where the objects are"
         raise ValueError(f"method: got 'lstm_attention', expected {expected}")
     actor = AttentiveActor(config.network, spec.action_size, spec.object_indices)
-    return _with_context(config, spec, ObjectTokens(config.network, spec.object_indices), actor)
+    network = make_context_network(ObjectTokens(config.network, spec.object_indices), actor, spec)
+    return _with_context(config, spec, network)
 
 
 def _actor(network: ContextConfig, spec: Spec) -> Actor:
     return Actor(network, spec.action_size, goal_size=len(spec.goal_indices))
 
 
-def _with_context(config: Config, spec: Spec, encoder: nn.Module, actor: nn.Module) -> ContextPolicy:
-    network = make_context_network(encoder, actor, spec.image_shape, spec.state_size, spec.action_size)
+def _with_context(config: Config, spec: Spec, network: ContextNetwork) -> ContextPolicy:
     return ContextPolicy(config.method, network, spec.goal_indices, calibration(config, spec))

@@ -17,7 +17,7 @@ from milx.config.schema import LARGEST_SIZE, VisionConfig, number
 from milx.networks.goal import StateGoalHead
 from milx.networks.layers import Dense
 from milx.networks.policy_network import Controller, ConvStack, PolicyOutput
-from milx.types import Params
+from milx.types import Params, Spec
 
 
 @dataclasses.dataclass
@@ -114,22 +114,18 @@ class Actor(nn.Module):
         return controller(features, state, jnp.broadcast_to(context, (len(state), *context.shape)), query)
 
 
-def make_context_network(
-    encoder: nn.Module, actor: nn.Module, image_shape: tuple[int, int] | None, state_size: int, action_size: int
-) -> ContextNetwork:
+def make_context_network(encoder: nn.Module, actor: nn.Module, spec: Spec) -> ContextNetwork:
     """Joins an encoder and an actor.
 
     Args:
         encoder: maps demonstrations to contexts.
         actor: maps contexts and observations to actions.
-        image_shape: (H, W); None where the policy sees no pixels.
-        state_size: S.
-        action_size: A.
+        spec: sizes of observations and actions.
     """
 
     def init(key: jax.Array) -> Params:
-        image = None if image_shape is None else jnp.zeros((1, *image_shape, 3), jnp.uint8)
-        state, action = jnp.zeros((1, state_size)), jnp.zeros((1, action_size))
+        image = None if spec.image_shape is None else jnp.zeros((1, *spec.image_shape, 3), jnp.uint8)
+        state, action = jnp.zeros((1, spec.state_size)), jnp.zeros((1, spec.action_size))
         encoder_key, actor_key = jax.random.split(key)
         context, encoding = encoder.init_with_output(encoder_key, image, state, action)
         return {

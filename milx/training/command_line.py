@@ -113,7 +113,7 @@ def parse(argv: Sequence[str], values: flags.FlagValues = FLAGS) -> list[str]:
         if values.data is None:
             config = assemble.make_config(values.env, values.method, preset, values.seed)
         else:
-            config = recorded.make_config(values.data, values.method, preset, values.seed)
+            config = recorded.config_for(values.data, values.method, preset, values.seed)
     except (ValueError, OSError) as error:
         raise flags.Error(str(error)) from error
     _check_fields(argv, config)
@@ -131,10 +131,11 @@ def parse(argv: Sequence[str], values: flags.FlagValues = FLAGS) -> list[str]:
 def _check_fields(argv: Sequence[str], config: Config) -> None:
     """Raises flags.Error for --config.NAME where there is no such field; lists those that exist."""
     known = assemble.fields(config)
-    unread = ("env.", "data.") if config.env_name == RECORDED else ("recorded.",)
+    unread = ("env.", "data.", "evaluation.", "train.redraw") if config.env_name == RECORDED else ("recorded.",)
     for arg in argv[1:]:
         name = arg.lstrip("-").split("=")[0]
-        if name.removeprefix("config.").startswith(unread) and name.startswith("config."):
+        read = not name.removeprefix("config.").startswith(unread) or name == "config.evaluation.shots"
+        if name.startswith("config.") and not read:
             where = "without --data" if config.env_name == RECORDED else "with --data"
             raise flags.Error(f"--{name}: expected only {where}; nothing reads it here")
         if name.startswith("config.") and (field := name.removeprefix("config.")) in _OWN_FLAGS:

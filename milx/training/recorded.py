@@ -30,7 +30,7 @@ from milx.training.state import Training
 from milx.types import SPEC_FILE, Demo, Params, Spec, TaskBatch
 
 
-def make_config(path: str | pathlib.Path, method: str = "mil", preset: str = "fast", seed: int = 0) -> Config:
+def config_for(path: str | pathlib.Path, method: str = "mil", preset: str = "fast", seed: int = 0) -> Config:
     """Configures a preset for a data set: its image size, and no convolutions where there are no images.
 
     Raises:

@@ -17,7 +17,7 @@ MANY = 4
 @pytest.fixture(scope="module")
 def file(trained, tmp_path_factory):
     path = tmp_path_factory.mktemp("demos") / "sub" / "train.npz"
-    pytrees.save(path, trained.train)
+    pytrees.write(path, trained.train)
     return path
 
 
@@ -35,7 +35,7 @@ def assert_equal(found, expected):
 
 
 def test_saved_set_loads_equal(trained, file, like):
-    loaded = pytrees.load(file, like)
+    loaded = pytrees.read(file, like)
     assert_equal(loaded, trained.train)
     assert (loaded.num_tasks, loaded.num_demos) == (8, 3)
     assert pytrees.fingerprint(loaded) == pytrees.fingerprint(trained.train)
@@ -60,7 +60,7 @@ def test_file_that_does_not_fit_is_refused(file, like, tmp_path, name, change, m
     path = tmp_path / "other.npz"
     np.savez(path, **arrays)
     with pytest.raises(ValueError) as error:
-        pytrees.load(path, like)
+        pytrees.read(path, like)
     assert str(error.value) == f"{path}: {message}"
 
 
@@ -74,7 +74,7 @@ class Payload:
 def test_a_pickle_is_refused_and_not_executed(tmp_path):
     np.savez(tmp_path / "file.npz", a=np.array([Payload()], object))
     with pytest.raises(ValueError, match="allow_pickle=False"):
-        pytrees.load(tmp_path / "file.npz", {"a": jnp.zeros(1)})
+        pytrees.read(tmp_path / "file.npz", {"a": jnp.zeros(1)})
 
 
 def test_fingerprint_sees_every_number(trained):

@@ -53,7 +53,7 @@ def folder(tmp_path_factory):
 
 
 def tiny_config(folder):
-    config = recorded.make_config(folder, preset="cpu")
+    config = recorded.config_for(folder, preset="cpu")
     config.recorded.horizon = HORIZON
     config.network.filters, config.network.strides, config.network.fc_layers = (4, 4), (2, 1), (40, 40)
     config.train.steps, config.train.log_every, config.train.eval_every = 600, 100, 200
