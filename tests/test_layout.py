@@ -1,0 +1,45 @@
+"""The house as BUILD.md draws it: which package may import which, and how large modules are."""
+
+import ast
+import pathlib
+
+import pytest
+
+ROOT = pathlib.Path(__file__).parents[1]
+FLOORS = (
+    {"types", "core"},
+    {"config", "render"},
+    {"networks", "envs"},
+    {"methods", "trajopt"},
+    {"data"},
+    {"evaluation", "deploy", "gym"},
+    {"training", "export", ""},
+    {"train", "evaluate", "collect"},
+)
+"""Packages and modules of milx, from the lowest floor up; "" is `milx/__init__.py`."""
+NUMBER = {room: number for number, floor in enumerate(FLOORS) for room in floor}
+
+
+def rooms(path):
+    """Returns the packages or modules of milx that a file imports, also inside functions."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == "milx":
+            inside = node.module.split(".")[1:]
+            found |= {inside[0]} if inside else {alias.name for alias in node.names}
+        elif isinstance(node, ast.Import):
+            names = [alias.name.split(".") for alias in node.names]
+            found |= {(*name, "")[1] for name in names if name[0] == "milx"}
+    return {room if room in NUMBER else "" for room in found}
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "milx").rglob("*.py")), ids=lambda path: str(path.relative_to(ROOT)))
+def test_imports_run_downward_and_modules_are_short(path):
+    room = path.relative_to(ROOT / "milx").parts[0].removesuffix(".py").removeprefix("__init__")
+    upward = {other for other in rooms(path) - {room} if NUMBER[other] >= NUMBER[room]}
+    assert not upward, f"{room} is on floor {NUMBER[room]}"
+    assert len(path.read_text().splitlines()) <= 350
+
+
+def test_few_modules_lie_beside_the_packages():
+    assert len(list((ROOT / "milx").glob("*.py"))) <= 8
