@@ -1,8 +1,10 @@
-"""Figure 3 of the paper: success against the number of training demonstrations, from pixels and from states.
+r"""Figure 3 of the paper: success against the number of training demonstrations, from pixels and from states.
 
     python experiments/paper/figure3.py                    # what is missing, then the figure
-    python experiments/paper/figure3.py --envs=push --tasks=48,192,768 --steps=15000 --out=results/figure3_push
-    python experiments/paper/figure3.py --envs=reach --preset=paper --out=results/figure3_paper    # as published
+    python experiments/paper/figure3.py --envs=push --tasks=48,192,768 --steps=15000 \
+        --out=experiments/results/figure3_push
+    python experiments/paper/figure3.py --envs=reach --preset=paper \
+        --out=experiments/results/figure3_paper            # as published
     python experiments/paper/figure3.py --preset=cpu --steps=200 --out=tiny --tasks=6,12 --seeds=1 --end_seeds=1
 
 Stopped and started again it goes on with its last checkpoint.
