@@ -2,8 +2,8 @@
 
     python -m milx.collect --env=reach --workdir=demos --config.data.tasks=100
 
-Each file holds the tasks, the states, the actions and whether each demonstration succeeds; `milx.core.pytrees.read`
-reads it.
+Each file holds the tasks, the states, the actions and whether each demonstration succeeds;
+`milx.core.pytrees.read(path, like)` reads it, with `like` from `milx.data.simulated.shapes`.
 """
 
 import pathlib

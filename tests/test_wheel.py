@@ -9,6 +9,8 @@ import zipfile
 
 import pytest
 
+import milx
+
 ROOT = pathlib.Path(__file__).parents[1]
 USE = """
 import milx, numpy as np
@@ -47,7 +49,7 @@ def test_the_policies_that_ship_act(installed):
     run, site = installed
     done = run("-c", USE)
     assert done.returncode == 0, done.stderr[-2000:]
-    assert done.stdout.split() == [str(site / "milx" / "__init__.py"), "0.1.0"]
+    assert done.stdout.split() == [str(site / "milx" / "__init__.py"), milx.__version__]
 
 
 def test_launchers_start(installed):
