@@ -37,5 +37,5 @@ def __getattr__(name: str) -> ModuleType:
         try:
             return importlib.import_module("milx.gym")
         except ModuleNotFoundError as error:
-            raise ImportError("milx.gym needs Gymnasium: pip install 'milx[gym]'") from error
+            raise ImportError("milx.gym needs Gymnasium: install milx with the extra 'gym'") from error
     raise AttributeError(f"module 'milx' has no attribute {name!r}")

@@ -200,7 +200,7 @@ def read_video(file: pathlib.Path, start: float, count: int, fps: float) -> Iter
     try:
         import av
     except ImportError as error:
-        raise ValueError("reading videos needs the package av: pip install 'milx[lerobot]'") from error
+        raise ValueError("reading videos needs the package av: install milx with the extra 'lerobot'") from error
     wanted = 0
     try:
         with av.open(str(file)) as container:
@@ -246,7 +246,7 @@ def _read_table(file: pathlib.Path, columns: tuple[str, ...]) -> Any:
         import pyarrow
         import pyarrow.parquet
     except ImportError as error:
-        raise ValueError("reading LeRobot data needs the package pyarrow: pip install 'milx[lerobot]'") from error
+        raise ValueError("reading LeRobot data needs pyarrow: install milx with the extra 'lerobot'") from error
     try:
         metadata = pyarrow.parquet.read_metadata(file)
         if missing := sorted(set(columns) - set(metadata.schema.to_arrow_schema().names)):

@@ -108,7 +108,7 @@ def _open(path: pathlib.Path) -> Any:
     try:
         import h5py
     except ImportError as error:
-        raise ValueError("reading robomimic's files needs the package h5py: pip install 'milx[robomimic]'") from error
+        raise ValueError("reading robomimic's files needs h5py: install milx with the extra 'robomimic'") from error
     try:
         return h5py.File(path, "r")
     except OSError as error:
