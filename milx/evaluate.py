@@ -22,7 +22,7 @@ def main(argv: list[str]) -> None:
     """Evaluates the run in --workdir."""
     if len(argv) > 1:
         raise app.UsageError(f"unexpected argument {argv[1]!r}")
-    logging.set_verbosity(logging.ERROR)  # Orbax warns of what is meant so
+    logging.set_verbosity(logging.ERROR)  # Orbax warns of things that milx does on purpose
     platform.configure()
     load_plugins()
     path = pathlib.Path(_WORKDIR.value) / "config.json"

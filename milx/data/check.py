@@ -83,7 +83,7 @@ def describe(data: DataSet, console: Console) -> None:
         console.print(
             f"{split}: {len(names)} tasks{': ' if names else ''}{', '.join(names[:5])}{' ...' if names[5:] else ''}"
         )
-    table = Table("", "least", "mean", "most", "standard deviation")
+    table = Table("", "minimum", "mean", "maximum", "standard deviation")
     for field, values in vectors(data).items():
         with np.errstate(invalid="ignore"):
             for i, column in enumerate(values.T):
@@ -96,7 +96,7 @@ def main(argv: list[str]) -> None:
     """Prints what a data set holds, and its problems."""
     if len(argv) != 2:
         raise app.UsageError("expected one argument, PATH")
-    console = Console(markup=False)  # names of tasks are anybody's
+    console = Console(markup=False)  # the names of tasks may look like markup
     try:
         data = DataSet(argv[1])
         describe(data, console)

@@ -28,7 +28,7 @@ from milx.types import SPLITS, Demo
 VERSION = 1
 ALL_FIELDS = ("image", "state", "action")
 MAX_BYTES = 1 << 33
-"""Of an array that has to be in memory at once: a larger one is refused before there is memory for it."""
+"""Maximum size of an array that has to be in memory at once: a larger one is refused before memory is allocated."""
 _CHUNK_BYTES = 1 << 20
 _MAX_CHUNK_BYTES = 1 << 28
 _GROUP = {"zarr_format": 3, "node_type": "group"}
@@ -249,7 +249,7 @@ class DataSet:
 
 
 def check_size(field: str, shape: tuple[int, ...], itemsize: int) -> None:
-    """Raises ValueError for an array that no one can mean, before there is memory for it."""
+    """Raises ValueError for an array larger than MAX_BYTES, before memory is allocated for it."""
     size = itemsize * math.prod(int(n) for n in shape)
     if size > MAX_BYTES:
         raise ValueError(

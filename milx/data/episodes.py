@@ -57,9 +57,9 @@ def define_flags(*, state: str, action: str, task: str) -> None:
     flags.DEFINE_string("state", state, "Where the robot's state is; empty for none.")
     flags.DEFINE_string("action", action, "Where the actions are; empty for none.")
     flags.DEFINE_string("task", task, "What makes a task: see above.")
-    flags.DEFINE_integer("height", 128, "Most rows of an image; larger ones are shrunk.", lower_bound=1)
-    flags.DEFINE_float("validation", 0.1, "Part of the tasks that becomes validation tasks.")
-    flags.DEFINE_float("test", 0.1, "Part of the tasks that becomes test tasks.")
+    flags.DEFINE_integer("height", 128, "Maximum number of rows of an image; larger ones are shrunk.", lower_bound=1)
+    flags.DEFINE_float("validation", 0.1, "Fraction of the tasks that becomes validation tasks.")
+    flags.DEFINE_float("test", 0.1, "Fraction of the tasks that becomes test tasks.")
 
 
 def run(argv: list[str], open_source: Callable[[str, Any], Source]) -> None:
@@ -83,11 +83,11 @@ def write(
         out: the folder; must not exist.
         episodes: all of them, in any order.
         sizes: of what they show.
-        held_out: which parts of the tasks become validation and test tasks.
+        held_out: the fractions of the tasks that become validation and test tasks.
         source: where they come from.
 
     Raises:
-        ValueError: for parts that are none, or an episode that does not fit the sizes.
+        ValueError: for fractions as `assign_splits` refuses them, or an episode that does not fit the sizes.
     """
     tasks: dict[str, list[Episode]] = {}
     for episode in episodes:
@@ -104,11 +104,11 @@ def assign_splits(names: list[str], validation: float, test: float) -> dict[str,
     """Assigns a split to every task, in an order that depends on nothing but the names; at least one trains.
 
     Raises:
-        ValueError: unless the parts are at least 0 and leave something for training.
+        ValueError: unless the fractions are at least 0 and leave something for training.
     """
     for field, part in (("validation", validation), ("test", test)):
         if not 0 <= part < 1:
-            raise ValueError(f"{field}: got {part}, expected a part of the tasks, at least 0 and less than 1")
+            raise ValueError(f"{field}: got {part}, expected a fraction of the tasks, at least 0 and less than 1")
     if validation + test >= 1:
         raise ValueError(f"validation + test: got {validation + test}, expected less than 1: the rest is for training")
     if (needed := 1 + (validation > 0) + (test > 0)) > len(names):

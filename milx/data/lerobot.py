@@ -37,7 +37,7 @@ class LeRobot:
         camera: the feature that holds images; "" for none, None for the only one.
         state: the feature that holds the robot's state; "" for none.
         action: the feature that holds actions; "" for none.
-        height: most rows of an image; larger ones are shrunk.
+        height: maximum number of rows of an image; larger ones are shrunk.
 
     Raises:
         ValueError: for another version (the message names LeRobot's converter), a feature that does not exist or does

@@ -28,7 +28,7 @@ class Robomimic:
         camera: the observation that holds images; "" for none, None for the only one.
         state: observations that together are the robot's state, separated by commas; "" for none.
         action: the data set that holds the actions; "" for none.
-        height: most rows of an image; larger ones are shrunk.
+        height: maximum number of rows of an image; larger ones are shrunk.
 
     Raises:
         ValueError: if there are no such files, or the first demonstration lacks something or has it in another shape.

@@ -18,7 +18,7 @@ from milx.methods.whitening import MIN_STD
 from milx.types import Demo, Params, TaskBatch, TaskParams
 
 MARGIN = 0.05
-"""A policy listens if another task's demonstration makes its error larger by more than this part."""
+"""A policy listens if another task's demonstration makes its error larger by more than this fraction."""
 ERRORS = {"own_demo": "its own", "other_demo": "another task's", "no_demo": "no"}
 """The errors that `measure` finds, by whose demonstration the policy saw."""
 _SMALLEST = 1e-3
@@ -35,7 +35,7 @@ def measure(method: Method, params: Params, batch: TaskBatch, most: int | None =
         method: what adapts and acts.
         params: what it has learned.
         batch: N tasks, of which neighbors should differ.
-        most: tasks that a device adapts to at once; all if None.
+        most: maximum number of tasks that a device adapts to at once; all if None.
 
     Returns:
         "own_demo", "other_demo" (with two tasks or more) and, where a policy can act without a demonstration,

@@ -16,7 +16,7 @@ class Method(abc.ABC):
 
     @property
     def imitation_steps(self) -> int:
-        """How many meta-updates, the first, minimize `imitation` instead of `loss`."""
+        """Number of meta-updates at the start that minimize `imitation` instead of `loss`."""
         return 0
 
     @abc.abstractmethod
@@ -29,7 +29,7 @@ class Method(abc.ABC):
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
         """Computes the meta-objective of a batch of N tasks, a scalar, and metrics, [N] each, "loss" among them.
 
-        `progress` is the part of the run that is done, in [0, 1].
+        `progress` is the fraction of the run that is done, in [0, 1].
         """
 
     def imitation(self, params: Params, batch: TaskBatch) -> tuple[jax.Array, dict[str, jax.Array]]:

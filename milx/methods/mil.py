@@ -55,7 +55,7 @@ class MILConfig(MethodConfig):
         inner_clip: bound on each entry of the inner gradient.
         first_order: do not differentiate through the inner gradient.
         variant: one of VARIANTS: what the inner step changes, or which of its results the meta-objective sees.
-        imitation_steps: so many meta-updates, the first, imitate all demonstrations without an inner step.
+        imitation_steps: number of meta-updates at the start that imitate all demonstrations without an inner step.
         sharpness: the power to which an adapted policy raises the weights of its goal head's votes. Above 1, votes that
             are divided between two objects fall to one of them. Meta-training always uses 1.
     """

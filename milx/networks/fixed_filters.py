@@ -70,7 +70,7 @@ def _read(file: pathlib.Path) -> dict[str, np.ndarray]:
         return load_file(file)
     except ImportError as error:
         raise ValueError(f"network.fixed_filters: {file} needs the package safetensors; pip install it") from error
-    except Exception as error:  # safetensors and zipfile have many
+    except Exception as error:  # safetensors and zipfile raise many types
         raise ValueError(f"network.fixed_filters: {file} cannot be read: {error}") from error
 
 

@@ -60,7 +60,7 @@ def run(main: Callable[[Config, str], None]) -> None:
             sys.exit(f"milx: {error}")
 
     def start(argv: Sequence[str]) -> None:
-        logging.set_verbosity(logging.ERROR)  # Orbax warns of what is meant so
+        logging.set_verbosity(logging.ERROR)  # Orbax warns of things that milx does on purpose
         if len(argv) > 1:
             raise app.UsageError(f"unexpected argument {argv[1]!r}")
         config = FLAGS.config

@@ -19,7 +19,7 @@ from milx.envs.place import containers
 from milx.envs.shapes.primitives import NUM_CAPSULES, Geoms
 
 TIMESTEP = 0.004
-"""s."""
+"""Time step of the simulation (s)."""
 SECONDS = 1.0
 """After this time the thing must lie still."""
 STILL = 0.05

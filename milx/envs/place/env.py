@@ -25,9 +25,9 @@ from milx.render.textures import Textures
 NUM_CONTAINERS = 3
 NUM_JOINTS = 7
 LOW, HIGH = (-0.36, -0.27), (0.0, 0.27)
-"""Where containers stand: least and greatest x and y of their middles (m)."""
+"""Where containers stand: minimum and maximum x and y of their centers (m)."""
 SPACING = 0.2
-"""Least distance between two containers' middles (m)."""
+"""Minimum distance between two containers' centers (m)."""
 THING_SIZE = (0.018, 0.026)
 """Unit of length of the held thing's shape (m), drawn uniformly."""
 CONTAINER_SIZE = (0.05, 0.065)
@@ -39,7 +39,7 @@ CLEARANCE = 0.02
 FALL_FRAMES = 10
 """Images of the fall in a film."""
 START_NOISE = 0.12
-"""Joints start within so much of _START (rad)."""
+"""Joints start within this distance of _START (rad)."""
 OFF_COST, TURN_COST = 5.0, 0.5
 """Weights of the residuals: 1/m, and of unit vectors, which have no unit."""
 _START = (0.0, -1.167, 0.0, 1.926, 0.0, 0.811, 0.0)

@@ -18,25 +18,25 @@ from milx.render import textures
 from milx.render.textures import Textures
 
 GOAL_RADIUS = 0.08
-"""The red disc's (m); its center is at x = y = 0."""
+"""Radius of the red disc (m); its center is at x = y = 0."""
 NEAR_GOAL = 0.13
 """The paper's released code counts steps in which the object is this close to the goal (m)."""
 STEPS_ON_GOAL = 10
-"""So many of the episode's steps the object must be on the disc."""
+"""Number of the episode's steps in which the object must be on the disc."""
 LOW, HIGH = (-0.3, -0.2), (0.0, 0.2)
-"""Where objects start: least and greatest x and y (m)."""
+"""Where objects start: minimum and maximum x and y (m)."""
 FROM_GOAL = 0.17
-"""Least distance of an object's start from the goal (m)."""
+"""Minimum distance of an object's start from the goal (m)."""
 SPACING = 0.15
-"""Least distance between the objects' centers at the start (m; paper: 0.1). They lie on opposite sides."""
+"""Minimum distance between the objects' centers at the start (m; paper: 0.1). They lie on opposite sides."""
 SIZE = (0.038, 0.052)
 """Unit of length of the shapes (m), drawn uniformly."""
 MASS = (0.2, 1.0)
-"""Of an object (kg), drawn uniformly."""
+"""Mass of an object (kg), drawn uniformly."""
 DAMPING = (0.2, 5.0)
-"""Of an object's sliding (N s/m), drawn uniformly."""
+"""Damping of an object's sliding (N s/m), drawn uniformly."""
 BEHIND = 1.25
-"""The hand comes down about so many times as far from the goal's center as the object is."""
+"""The hand comes down about this many times as far from the goal's center as the object is."""
 NUM_JOINTS = 7
 _START = (0.0, -0.895, 0.0, 2.397, 0.0, 0.069, 0.0)
 OBJECT_COST, TIP_COST, FINAL_COST = 1.0, 0.5, 10.0

@@ -15,7 +15,7 @@ NUM_OBJECTS = 3
 EXTENT = 0.2
 """Cubes stand within +-EXTENT of the arm's base in x and y (m)."""
 SPACING = 0.15
-"""Least distance between two cubes' centers (m)."""
+"""Minimum distance between two cubes' centers (m)."""
 TOUCH = 0.05
 """A fingertip closer than this to the target's center, seen from above, has reached it (m)."""
 LAST_STEPS = 10
