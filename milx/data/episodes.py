@@ -63,7 +63,16 @@ def define_flags(*, state: str, action: str, task: str) -> None:
 
 
 def run(argv: list[str], open_source: Callable[[str, Any], Source]) -> None:
-    """Runs the command line of an importer: PATH OUT; bad input ends with a message, not a traceback."""
+    """Runs the command line of an importer: PATH OUT; bad input ends with a message, not a traceback.
+
+    Args:
+        argv: the name of the program, PATH and OUT.
+        open_source: opens PATH with the values of the flags.
+
+    Raises:
+        absl.app.UsageError: for another number of arguments.
+        SystemExit: if the files cannot be read or imported; the message says why.
+    """
     if len(argv) != 3:
         raise app.UsageError("expected two arguments, PATH and OUT")
     try:

@@ -111,6 +111,9 @@ def run_trials(
         key: draws the trial scenes.
         misled: show each task's policy the next task's demonstrations instead, and judge it by its own task.
         first: number of trials of each task to run, the first ones; None for all.
+
+    Returns:
+        The success of every trial, and the states that it visited.
     """
     scene_key, act_key = jax.random.split(key)
     scene = trial_scenes(env, demos.task, scene_key, config.trials)

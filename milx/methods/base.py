@@ -33,7 +33,11 @@ class Method(abc.ABC):
         """
 
     def imitation(self, params: Params, batch: TaskBatch) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """Computes the loss without an inner step, to start from; for methods that have one (`imitation_steps`)."""
+        """Computes the loss without an inner step, which the first `imitation_steps` meta-updates minimize.
+
+        Raises:
+            NotImplementedError: if the method has no such loss; its `imitation_steps` is then 0.
+        """
         raise NotImplementedError
 
     @abc.abstractmethod

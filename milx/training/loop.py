@@ -74,6 +74,20 @@ def fit(
     A checkpoint is saved before it is validated, and then once more with its score: a signal during a validation loses
     nothing but that.
 
+    Args:
+        scan: runs `config.log_every` meta-updates.
+        state: where training starts or goes on.
+        key: the key of the batches, from `initial_state`.
+        training: the data.
+        config: the number of updates, and how often to log and to validate.
+        checkpoints: those of the run.
+        hooks: what to call for logging, validation and saving.
+        clock: counts the seconds of "train" and "evaluate".
+        stop: whether the process was told to end.
+
+    Returns:
+        The state after the last update, or after the scan in which `stop` was asked for.
+
     Raises:
         ValueError: if MOST_IN_VAIN updates in a row were skipped because they were not finite, or the last checkpoint
             could not be written.

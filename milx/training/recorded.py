@@ -60,7 +60,19 @@ class Statistics(NamedTuple):
 
 
 def read_vectors(data: DataSet, tasks: list[int], horizon: int) -> Statistics:
-    """Reads all states and actions of these tasks, resampled to the horizon."""
+    """Reads all states and actions of these tasks, resampled to the horizon.
+
+    Args:
+        data: the data set.
+        tasks: numbers of the tasks.
+        horizon: time steps to which each demonstration is resampled.
+
+    Returns:
+        The states of all demonstrations, and the actions of those that show them.
+
+    Raises:
+        ValueError: if a state or an action is not finite; the message names the demonstration.
+    """
     states, actions = [], []
     for task in tasks:
         info = data.header.tasks[task]

@@ -66,6 +66,14 @@ def trial_key(split: str) -> jax.Array:
 def training_on(env: envs.Env, config: Config, train: DemoSet) -> Training:
     """Makes a run's view of planned demonstrations.
 
+    Args:
+        env: the environment that they are of.
+        config: of the run.
+        train: the demonstrations for training.
+
+    Returns:
+        The demonstrations with their hash, their statistics and some first images.
+
     Raises:
         ValueError: if no task has enough successful demonstrations for support and query.
     """
@@ -84,7 +92,18 @@ def training_on(env: envs.Env, config: Config, train: DemoSet) -> Training:
 def validation_of(
     env: envs.Env, method: Method, params: Params, demos: DemoSet, config: EvalConfig
 ) -> tuple[float, dict[str, float]]:
-    """Evaluates on the validation tasks: success in their trials, and what `listening.measure` finds there."""
+    """Evaluates on the validation tasks.
+
+    Args:
+        env: the environment.
+        method: what adapts and acts.
+        params: what it has learned.
+        demos: of the validation tasks.
+        config: trials, shots and batch.
+
+    Returns:
+        The success rate in their trials, and what `listening.measure` finds there.
+    """
     trials = closed_loop.run_trials(env, method, params, demos, config, trial_key("validation"))
     return float(trials.success.mean()), closed_loop.listen(env, method, params, demos, config.shots)
 
@@ -92,7 +111,19 @@ def validation_of(
 def result_of(
     env: envs.Env, method: Method, params: Params, demos: DemoSet, config: Config, baselines: closed_loop.Baselines
 ) -> tuple[Trials, dict[str, Any]]:
-    """Evaluates on the test tasks: the trials, and what the result file says of them."""
+    """Evaluates on the test tasks, after their own demonstrations and after another task's.
+
+    Args:
+        env: the environment.
+        method: what adapts and acts.
+        params: what it has learned.
+        demos: of the test tasks.
+        config: of the run.
+        baselines: what stands beside the results.
+
+    Returns:
+        The trials after the tasks' own demonstrations, and what the result file says of them.
+    """
     run = functools.partial(closed_loop.run_trials, env, method, params, demos, config.evaluation, trial_key("test"))
     trials, misled = run(), run(misled=True, first=config.evaluation.baseline_trials)
     return trials, closed_loop.summarize(env, config, demos.task, trials, misled, baselines)
