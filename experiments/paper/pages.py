@@ -69,6 +69,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "headline": headline,
     "reach": lambda: table.markdown(RESULTS / "reach"),
     "push": lambda: table.markdown(RESULTS / "push"),
+    "place": lambda: table.markdown(RESULTS / "place"),
     "table1": lambda: _paper_table(table1.TABLE),
     "table2": lambda: _paper_table(table2.TABLE),
     "table3": lambda: _paper_table(table3.TABLE),
