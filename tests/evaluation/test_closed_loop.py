@@ -143,7 +143,7 @@ def test_baselines_run_in_the_first_trials(trained, monkeypatch, trials, asked, 
     config = dataclasses.replace(trained.config.evaluation, trials=trials, baseline_trials=asked)
     asked_for = {}
 
-    def watch(env, task, scene, keys, options, noise):
+    def watch(env, task, scene, keys, options, noise, tactic):
         asked_for.update(task=task, scene=scene)
         assert noise == 0.0
         return jax.tree.map(lambda x: jnp.repeat(x[:, None], env.horizon + 1, axis=1), scene), None
