@@ -9,8 +9,8 @@ with a, exp is Rodrigues' formula, and s is the position of the end in the last 
 
     (R_j a_j x (x - p_j), R_j a_j).
 
-MJX computes the same for any model. Of its program, which visits all bodies and geoms, a planner compiles several
-copies with derivatives; this one compiles ten times faster and runs four times faster on a CPU.
+MJX computes the same for any model, in a larger program that visits all bodies and geoms. A planner compiles several
+copies of it with derivatives.
 """
 
 from typing import NamedTuple
@@ -70,17 +70,19 @@ class Chain:
         axis, offset, turn, end = (
             jnp.asarray(x, angles.dtype) for x in (self._axis, self._offset, self._turn, self._end)
         )
-        cross = jnp.cross(axis[:, None], jnp.eye(3, dtype=angles.dtype), axisb=-1).swapaxes(1, 2)
+        eye = jnp.eye(3, dtype=angles.dtype)
+        cross = jnp.cross(axis[:, None], eye).swapaxes(1, 2)
         cos, sin = jnp.cos(angles)[:, None, None], jnp.sin(angles)[:, None, None]
-        rotation = turn @ (cos * jnp.eye(3) + sin * cross + (1 - cos) * axis[:, :, None] * axis[:, None])
+        rotation = turn @ (cos * eye + sin * cross + (1 - cos) * axis[:, :, None] * axis[:, None])
 
         def link(frame: tuple, body: tuple) -> tuple[tuple, tuple]:
             position, axes = frame
             position, axes = position + axes @ body[0], axes @ body[1]
             return (position, axes), (position, axes)
 
-        origin = jnp.zeros(3, angles.dtype), jnp.eye(3, dtype=angles.dtype)
-        (position, axes), (joint, frames) = jax.lax.scan(link, origin, (offset, rotation), unroll=True)
+        (position, axes), (joint, frames) = jax.lax.scan(
+            link, (jnp.zeros_like(end), eye), (offset, rotation), unroll=True
+        )
         position = position + axes @ end
         turned = jnp.einsum("jik,jk->ji", frames, axis)
         lever = jnp.cross(turned, position - joint)
