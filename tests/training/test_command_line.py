@@ -10,6 +10,11 @@ import sys
 import types
 
 import pytest
+from absl import flags
+
+from milx.config.assemble import make_config
+from milx.data import RECORDED
+from milx.training import command_line
 
 
 def main(folder, arguments):
@@ -128,6 +133,14 @@ def test_a_package_of_ones_own_is_found(tmp_path, monkeypatch):
     said = train("--env=nope").stderr
     assert "plugin mine = mine: AttributeError" in said, "a broken package is named"
     assert "env: got 'nope'" in said, "and milx goes on without it"
+
+
+def test_flags_of_trials_are_refused_with_recorded_data():
+    config = make_config(RECORDED, preset="cpu")
+    command_line._check_fields(["milx.train", "--config.evaluation.shots=2"], config)
+    for name in ("evaluation.trials", "train.redraw", "env.image_shape"):
+        with pytest.raises(flags.Error, match=f"--config.{name}: expected only without --data; nothing reads it here"):
+            command_line._check_fields(["milx.train", f"--config.{name}=7"], config)
 
 
 def test_value_of_another_type_ends_with_a_message(train):
