@@ -85,7 +85,7 @@ def measure_compilation(config: Config, env: Env, report: common.Report) -> None
             jax.clear_caches()
             compilation_cache.reset_cache()  # JAX would go on with the folder it used first
             began = time.perf_counter()
-            Trainer.run.lower(trainer, state, demos, jax.random.key(1), 100).compile(platform.pixel_options(env.chain))
+            Trainer.run.lower(trainer, state, demos, jax.random.key(1), 100).compile(platform.pixel_options())
             report.add(f"tracing and compiling the training scan, {name}", time.perf_counter() - began, "s")
 
 

@@ -222,7 +222,7 @@ class Cells:
 
         def compile_scan() -> Any:
             lowered = Trainer.run.lower(trainer, state, training.at(0), key, config.train.log_every)
-            return lowered.compile(platform.pixel_options(env.chain))
+            return lowered.compile(platform.pixel_options())
 
         with clock("compile"):
             scan = self._once(("compiled", self._programs(config)), compile_scan)

@@ -17,6 +17,7 @@ import numpy as np
 
 from milx.core import platform
 from milx.core.mjx import mjx
+from milx.envs.kinematics import kinematics
 from milx.render.scene import Renderer
 from milx.render.textures import Textures
 from milx.types import SPLITS, Observation, Spec
@@ -109,14 +110,6 @@ class Env(abc.ABC, Generic[TaskT]):
     def action_size(self) -> int:
         """A, the number of actuators."""
         return self.mj_model.nu
-
-    @property
-    def chain(self) -> int:
-        """Joints in the longest kinematic chain."""
-        model, joints = self.mj_model, [0]
-        for body in range(1, model.nbody):
-            joints.append(joints[model.body_parentid[body]] + model.body_jntnum[body])
-        return int(max(joints))
 
     @property
     def action_range(self) -> tuple[jax.Array, jax.Array]:
@@ -273,7 +266,7 @@ class Env(abc.ABC, Generic[TaskT]):
 
     def _draw(self, model: mjx.Model, task: TaskT, state: State) -> jax.Array:
         """Draws the image of a state in this model."""
-        data = mjx.kinematics(model, self.data(state))
+        data = kinematics(model, self.data(state))
         data = mjx.camlight(model, mjx.com_pos(model, data))
         scene = dataclasses.replace(
             self.renderer.scene(data),

@@ -13,12 +13,15 @@ MJX computes the same for any model, in a larger program that visits all bodies 
 copies of it with derivatives.
 """
 
+import functools
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+
+_product = functools.partial(jnp.matmul, precision=jax.lax.Precision.HIGHEST)  # a GPU rounds more by default
 
 
 class Pose(NamedTuple):
@@ -73,17 +76,17 @@ class Chain:
         eye = jnp.eye(3, dtype=angles.dtype)
         cross = jnp.cross(axis[:, None], eye).swapaxes(1, 2)
         cos, sin = jnp.cos(angles)[:, None, None], jnp.sin(angles)[:, None, None]
-        rotation = turn @ (cos * eye + sin * cross + (1 - cos) * axis[:, :, None] * axis[:, None])
+        rotation = _product(turn, cos * eye + sin * cross + (1 - cos) * axis[:, :, None] * axis[:, None])
 
         def link(frame: tuple, body: tuple) -> tuple[tuple, tuple]:
             position, axes = frame
-            position, axes = position + axes @ body[0], axes @ body[1]
+            position, axes = position + _product(axes, body[0]), _product(axes, body[1])
             return (position, axes), (position, axes)
 
         (position, axes), (joint, frames) = jax.lax.scan(
             link, (jnp.zeros_like(end), eye), (offset, rotation), unroll=True
         )
-        position = position + axes @ end
-        turned = jnp.einsum("jik,jk->ji", frames, axis)
+        position = position + _product(axes, end)
+        turned = _product(frames, axis[..., None])[..., 0]
         lever = jnp.cross(turned, position - joint)
         return Pose(position, axes, jnp.concatenate([lever, turned], axis=1).T)

@@ -131,7 +131,7 @@ class RecordedRun(Run):
             return sample_batch(recorded, keys, train.shots, *frames, self.given_action, tuple(settings.goal_indices))
 
         spec = spec_of(self.data, config)
-        super().__init__(config, spec, sample, 0, workdir, console)
+        super().__init__(config, spec, sample, workdir, console)
         results.write_json(self.folder / SPEC_FILE, spec.to_dict())
 
     def _enough(self, task: int, shots: int) -> bool:

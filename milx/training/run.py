@@ -51,7 +51,6 @@ class Run(abc.ABC):
         config: what to run.
         spec: the sizes of what the policy sees and does.
         sample: draws batches of the data of `Training.at`.
-        chain: joints in the longest kinematic chain that training computes poses of.
         workdir: the folder; made if missing.
         console: where to report progress.
 
@@ -68,11 +67,10 @@ class Run(abc.ABC):
         config: Config,
         spec: Spec,
         sample: Sample,
-        chain: int,
         workdir: str | pathlib.Path,
         console: Console | None = None,
     ):
-        self.config, self.spec, self._chain = config, spec, chain
+        self.config, self.spec = config, spec
         self.folder = pathlib.Path(workdir)
         self.console = console or Console(quiet=not parallel.is_first_host())
         self._checkpoints = self.folder / "checkpoints"
@@ -236,7 +234,7 @@ class Run(abc.ABC):
 
         def compile_step() -> Callable[..., Any]:
             lowered = Trainer.run.lower(self.trainer, state, data, jax.random.key(0), steps)
-            return lowered.compile(platform.pixel_options(self._chain))
+            return lowered.compile(platform.pixel_options())
 
         thread = ThreadPoolExecutor(max_workers=1)  # tracing holds Python's lock: more would slow the planner's down
         compiled = thread.submit(compile_step)

@@ -156,7 +156,7 @@ class SimulatedRun(Run):
         self.env = envs.make(config.env_name, config.env.image_shape, config.env.action_cost)
         self._demonstrations: dict[str, dict[str, float]] = {}
         sample = demos_lib.sampler(self.env, config.train)
-        super().__init__(config, self.env.spec, sample, self.env.chain, workdir, console)
+        super().__init__(config, self.env.spec, sample, workdir, console)
 
     def demos(self, split: str) -> DemoSet:
         """Returns the demonstrations of a split, planned or from the cache of earlier runs."""

@@ -15,6 +15,7 @@ from milx.core.mjx import mjx
 from milx.envs import shapes
 from milx.envs.base import ASSETS, OUT_OF_THE_WAY, Env, State, check_split
 from milx.envs.chain import Chain, Pose
+from milx.envs.kinematics import kinematics
 from milx.envs.place import containers, drop
 from milx.envs.place.containers import CONTAINERS
 from milx.envs.place.drop import Fall
@@ -253,8 +254,8 @@ class Place(Env[PlaceTask]):
         """Draws images [T + 1 + FALL_FRAMES, H, W, 3] uint8 of an episode and of the fall that follows it."""
         last, model = jax.tree.map(lambda x: x[-1], states), self.model_of(task)
         thing, *_ = self._geoms_of(task)
-        data = mjx.kinematics(model, self.data(last))
-        hand = Rotation.from_matrix(data.xmat[self._hand].reshape(3, 3))
+        data = kinematics(model, self.data(last))
+        hand = Rotation.from_matrix(data.xmat[self._hand])
 
         def draw(fall: Fall) -> jax.Array:
             place, turn = self._drop.held_at(*thing, fall)
