@@ -90,6 +90,7 @@ _RESULTS = {
     "push-two-heads": Row("push, two heads", "push", {}, "85.8 / 88.8%", (1, 5)),
     "push-video-state": Row("push, video + state", "push", _VIDEO_STATE, "72.5 / 78.2%", (1, 5)),
     "push-video": Row("push, video", "push", _VIDEO, "66.4 / 70.5%", (1, 5)),
+    "place-3000": Row("place, 3,000 training tasks", "place", {"data.tasks": 3000, "train.steps": 10_000}, "90%"),
     "place": Row("place", "place", {}, "90%"),
     "place-video": Row("place, video", "place", _VIDEO, "68.3%"),
 }

@@ -18,7 +18,7 @@ _PAPER = (
     CONDITIONED
     | _WORLD
     | {
-        "data.tasks": 3000,
+        "data.tasks": 12_000,
         "data.demos_per_task": 2,
         "network.filters": (64, 64, 64, 64, 64),
         "network.strides": (2, 2, 2, 1, 1),
@@ -35,7 +35,7 @@ _PAPER = (
         "method.whiten_actions": True,
         "method.goal_weight": 1.0,
         "method.imitation_steps": 2000,
-        "train.steps": 10_000,
+        "train.steps": 20_000,
         "train.meta_batch": 12,
     }
 )
