@@ -106,7 +106,8 @@ class Cells:
     """Runs cells, each a configuration with a name, and keeps what later ones can use again.
 
     A process that is killed leaves the checkpoint of its last validation in `unfinished/` beside the result files. The
-    next one goes on from there if all is the same: configuration, demonstrations, commit, hardware and versions.
+    next one goes on from there if configuration, commit and versions are the same. The folder can be carried to another
+    machine, which plans the same demonstrations up to rounding.
 
     Args:
         folder: where the result files are.
@@ -197,18 +198,20 @@ class Cells:
     def _train(self, name: str, config: Config) -> Trained:
         times = self.capacity // config.data.tasks
         repeated = jax.tree.map(lambda x: jnp.concatenate([x] * times), self._first_tasks(config))
-        training = training_on(self._env(config), config, repeated)
-        folder = self._unfinished(config, training.dataset_hash)
+        identity = self._identity(config)
+        training = training_on(self._env(config), config, repeated)._replace(dataset_hash=identity)
+        folder = self.folder / "unfinished" / identity
         folder.mkdir(parents=True, exist_ok=True)
         with signals.one_trainer(folder), contextlib.closing(Checkpoints(folder / "checkpoints")) as checkpoints:
             trained = self._fit(name, config, training, checkpoints)
         self._unneeded.append(folder)
         return trained
 
-    def _unfinished(self, config: Config, dataset_hash: str) -> pathlib.Path:
-        """Names the folder of a cell's checkpoints until it has its file: one for all on which they depend."""
-        contents = json.dumps([_contents(config), dataset_hash, provenance.origin()])
-        return self.folder / "unfinished" / hashlib.sha256(contents.encode()).hexdigest()[:16]
+    def _identity(self, config: Config) -> str:
+        """Names all on which a cell's parameters depend, but for rounding."""
+        origin = provenance.origin()
+        contents = json.dumps([_contents(config), self.capacity, origin["commit"], origin["versions"]])
+        return hashlib.sha256(contents.encode()).hexdigest()[:16]
 
     def _fit(self, name: str, config: Config, training: Training, checkpoints: Checkpoints) -> Trained:
         env, trainer = self._env(config), self._trainer(config)

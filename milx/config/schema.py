@@ -187,6 +187,8 @@ class TrainConfig:
         shots: support demonstrations of each task.
         support_frames: time steps sampled from each support demonstration; None for all.
         query_frames: time steps sampled from each query demonstration; None for all.
+        frame_exponent: 1 samples time steps evenly, a larger exponent samples more of the beginning of a
+            demonstration, where the policy cannot yet see from the robot's own pose where it is going.
         redraw: whenever a task is sampled, give it a new appearance of the training split, and give the distractors in
             its demonstrations new positions. A few planned demonstrations then stand for many tasks and scenes.
         log_every: meta-updates in one scan on the device; metrics are logged after every scan.
@@ -198,6 +200,7 @@ class TrainConfig:
     shots: int = 1
     support_frames: int | None = None
     query_frames: int | None = None
+    frame_exponent: float = number(1.0, 1, 10)
     redraw: bool = False
     log_every: int = 100
     eval_every: int = 2000

@@ -77,6 +77,7 @@ def sample_batch(
     shots: int,
     support_frames: int | None,
     query_frames: int | None,
+    exponent: float,
     given_action: bool,
     goal_indices: tuple[int, ...],
 ) -> TaskBatch:
@@ -88,6 +89,7 @@ def sample_batch(
         shots: K, support demonstrations.
         support_frames: time steps drawn from each support demonstration; None for all.
         query_frames: time steps drawn from the query demonstration; None for all.
+        exponent: see `frame_indices`.
         given_action: the support, too, must show actions.
         goal_indices: entries of the state that tell where the robot is (`milx.data.goals`).
     """
@@ -104,7 +106,7 @@ def sample_batch(
         chosen = jax.random.choice(support_key, len(acts), (shots,), replace=False, p=others / others.sum())
 
         def show(d: jax.Array, key: jax.Array, frames: int | None) -> Demo:
-            index = frame_indices(key, horizon, frames)
+            index = frame_indices(key, horizon, frames, exponent)
             demo = jax.tree.map(lambda x: x[n, d], recorded.demo)
             return jax.tree.map(lambda x: x[index], with_goals(demo, goal_indices, None))
 

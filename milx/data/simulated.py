@@ -13,6 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 
 from milx.config.schema import DataConfig, TrainConfig
 from milx.core import pytrees
@@ -121,15 +122,19 @@ def _draw(env: Env, key: jax.Array, split: str, num_tasks: int, num_demos: int) 
     return tasks, each, state, jax.random.split(noise_key, total)
 
 
-def frame_indices(key: jax.Array, length: int, count: int | None) -> jax.Array:
-    """Draws `count` increasing time steps below `length`, one from each of equal parts, the last step always.
+def frame_indices(key: jax.Array, length: int, count: int | None, exponent: float = 1.0) -> jax.Array:
+    """Draws n = `count` increasing time steps below T = `length`, one from each of n - 1 parts, and the last one.
 
-    None draws all of them.
+    Part i = 0, .., n - 2 begins at floor((T - 1) (i / (n - 1))^e), or one after the part before it if that is later,
+    with the exponent e: at 1 the parts are equally long, above 1 the first ones are the shortest. With `count` None or
+    at least T, all time steps are returned.
     """
     if count is None or count >= length:
         return jnp.arange(length)
-    edges = jnp.arange(count) * (length - 1) // max(count - 1, 1)
-    offset = jax.random.uniform(key, (count - 1,)) * jnp.diff(edges)
+    part = np.arange(count)
+    edges = np.floor((length - 1) * part**exponent / max(count - 1, 1) ** exponent).astype(int)
+    edges = np.maximum.accumulate(edges - part) + part  # no part is empty
+    offset = jax.random.uniform(key, (count - 1,)) * np.diff(edges)
     return jnp.append(edges[:-1] + offset.astype(jnp.int32), length - 1)
 
 
@@ -158,6 +163,7 @@ def sample_batch(
     support_frames: int | None = None,
     query_frames: int | None = None,
     redraw: bool = False,
+    exponent: float = 1.0,
 ) -> TaskBatch:
     """Draws tasks and different demonstrations of each that succeed, and renders them.
 
@@ -169,6 +175,7 @@ def sample_batch(
         support_frames: time steps drawn from each support demonstration; None for all.
         query_frames: time steps drawn from the query demonstration; None for all.
         redraw: show a task in a new appearance of the training split, and each of its demonstrations in a new scene.
+        exponent: see `frame_indices`.
     """
     enough = (demos.success.sum(axis=1) > shots).astype(float)
 
@@ -184,7 +191,7 @@ def sample_batch(
             states, action = jax.tree.map(lambda x: x[n, d], (demos.states, demos.action))
             if redraw:
                 states = env.redraw_scene(jax.random.fold_in(key, 1), task, states)
-            return render_demo(env, task, states, action, frame_indices(key, action.shape[0], frames))
+            return render_demo(env, task, states, action, frame_indices(key, action.shape[0], frames, exponent))
 
         support = [load(chosen[k], jax.random.fold_in(support_key, k), support_frames) for k in range(shots)]
         query = load(chosen[shots], query_key, query_frames)
@@ -202,7 +209,7 @@ def sampler(env: Env, train: TrainConfig) -> Callable[[DemoSet, jax.Array], Task
 
     def sample(demos: DemoSet, keys: jax.Array) -> TaskBatch:
         frames = train.support_frames, train.query_frames
-        return sample_batch(env, demos, keys, train.shots, *frames, train.redraw)
+        return sample_batch(env, demos, keys, train.shots, *frames, train.redraw, train.frame_exponent)
 
     return sample
 

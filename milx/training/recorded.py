@@ -127,7 +127,7 @@ class RecordedRun(Run):
         self.shards = Shards(self.data, tasks, settings.horizon, settings.gib, config.seed, train.shots + 1)
 
         def sample(recorded: Recorded, keys: jax.Array) -> TaskBatch:
-            frames = train.support_frames, train.query_frames
+            frames = train.support_frames, train.query_frames, train.frame_exponent
             return sample_batch(recorded, keys, train.shots, *frames, self.given_action, tuple(settings.goal_indices))
 
         spec = spec_of(self.data, config)

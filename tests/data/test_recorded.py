@@ -53,7 +53,7 @@ def test_loaded_demonstrations_are_resampled_and_the_rest_is_marked(data):
 
 @pytest.mark.parametrize(("given_action", "pairs"), [(True, {(0, 1), (1, 0)}), (False, None)])
 def test_batches_hold_different_demonstrations_of_one_task_and_queries_act(data, given_action, pairs):
-    draw = jax.jit(lambda keys: sample_batch(jax.device_put(whole(data)), keys, 1, 3, None, given_action, (2, 0)))
+    draw = jax.jit(lambda keys: sample_batch(jax.device_put(whole(data)), keys, 1, 3, None, 1.0, given_action, (2, 0)))
     batch = draw(jax.random.split(jax.random.key(0), 600))
     support, query = batch.support, batch.query
     assert support.state.shape == (600, 1, 3, 3)

@@ -200,6 +200,21 @@ def test_frames_come_one_from_each_part_and_the_last_always(length, count):
     np.testing.assert_array_equal(np.unique(index), drawn, "every step is drawn sometimes")
 
 
+@pytest.mark.parametrize(("length", "count", "exponent"), [(50, 4, 2.0), (100, 8, 2.0), (50, 10, 3.0), (9, 8, 2.0)])
+def test_a_larger_exponent_draws_more_of_the_beginning(length, count, exponent):
+    keys = jax.random.split(jax.random.key(1), 20_000)
+    index = np.asarray(jax.vmap(lambda key: demos_lib.frame_indices(key, length, count, exponent))(keys))
+    assert (np.diff(index, axis=1) > 0).all()
+    assert (index[:, -1] == length - 1).all()
+    # Each part is drawn from evenly, so its mean is that of its ends, which are T - 1 times (i / (n - 1))^e.
+    edges = np.floor((length - 1) * (np.arange(count) / (count - 1)) ** exponent + 1e-9)
+    for i in range(1, count):
+        edges[i] = max(edges[i], edges[i - 1] + 1)
+    middle = (edges[:-1] + edges[1:] - 1) / 2
+    deviation = np.diff(edges) / np.sqrt(12 * len(keys))
+    np.testing.assert_array_less(np.abs(index[:, :-1].mean(axis=0) - middle), 5 * deviation)
+
+
 @pytest.mark.parametrize("count", [None, 5, 8])
 def test_all_frames(count):
     np.testing.assert_array_equal(demos_lib.frame_indices(jax.random.key(0), 5, count), np.arange(5))
