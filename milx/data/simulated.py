@@ -148,11 +148,26 @@ def render_demo(env: Env, task: Task, states: State, action: jax.Array, index: j
         action: actions taken.
         index: [F] time steps to keep; all T if None.
     """
-    index = jnp.arange(len(action)) if index is None else index
-    seen = jax.vmap(env.observe, in_axes=(None, 0))(task, jax.tree.map(lambda x: x[index], states))
-    robot = jax.vmap(env.robot_state)(jax.tree.map(lambda x: x[: len(action)], states))
-    goal = goals(robot, env.goal_indices, env.height_index)[index]
-    return Demo(image=seen.image, state=seen.state, action=action[index], goal=goal)
+    return render_demos(env, task, [(states, action, jnp.arange(len(action)) if index is None else index)])[0]
+
+
+def render_demos(env: Env, task: Task, demos: list[tuple[State, jax.Array, jax.Array]]) -> list[Demo]:
+    """Observes several demonstrations of a task, each of states, actions and time steps to keep, as `render_demo`.
+
+    All images are drawn together, so that a program has only one copy of the renderer.
+    """
+    kept = [jax.tree.map(lambda x, index=index: x[index], states) for states, _, index in demos]
+    images: list[jax.Array | None] = [None] * len(demos)
+    if env.vision:
+        drawn = jax.vmap(env.render, in_axes=(None, 0))(task, jax.tree.map(lambda *xs: jnp.concatenate(xs), *kept))
+        images = list(jnp.split(drawn, np.cumsum([len(index) for *_, index in demos])[:-1]))
+    observed = []
+    for image, (states, action, index) in zip(images, demos, strict=True):
+        before = jax.tree.map(lambda x, action=action: x[: len(action)], states)
+        robot = jax.vmap(env.robot_state)(before)
+        goal = goals(robot, env.goal_indices, env.height_index)[index]
+        observed.append(Demo(image=image, state=robot[index], action=action[index], goal=goal))
+    return observed
 
 
 def sample_batch(
@@ -187,14 +202,14 @@ def sample_batch(
         if redraw:
             task = env.redraw_appearance(jax.random.fold_in(key, 1), task)
 
-        def load(d: jax.Array, key: jax.Array, frames: int | None) -> Demo:
+        def load(d: jax.Array, key: jax.Array, frames: int | None) -> tuple[State, jax.Array, jax.Array]:
             states, action = jax.tree.map(lambda x: x[n, d], (demos.states, demos.action))
             if redraw:
                 states = env.redraw_scene(jax.random.fold_in(key, 1), task, states)
-            return render_demo(env, task, states, action, frame_indices(key, action.shape[0], frames, exponent))
+            return states, action, frame_indices(key, action.shape[0], frames, exponent)
 
-        support = [load(chosen[k], jax.random.fold_in(support_key, k), support_frames) for k in range(shots)]
-        query = load(chosen[shots], query_key, query_frames)
+        shown = [load(chosen[k], jax.random.fold_in(support_key, k), support_frames) for k in range(shots)]
+        *support, query = render_demos(env, task, [*shown, load(chosen[shots], query_key, query_frames)])
         return TaskBatch(
             support=jax.tree.map(lambda *xs: jnp.stack(xs), *support),
             query=jax.tree.map(lambda x: x[None], query),

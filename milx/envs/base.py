@@ -77,6 +77,8 @@ class Env(abc.ABC, Generic[TaskT]):
             tells it.
         tactics: ways in which the controller may go about a scene, in the order of preference; what the numbers mean is
             the controller's affair.
+        long_chain: whether a step computes MJX's kinematics of more than three joints in a chain, which old CPU
+            compilers must not fuse (`platform.pixel_options`).
         action_cost: weight of the action in the planner's running cost (no unit): the lower, the faster the expert.
         version: raised when tasks, scenes, physics, costs or the controller change, so that no demonstration planned
             before it is taken for one planned after it.
@@ -93,6 +95,7 @@ class Env(abc.ABC, Generic[TaskT]):
     vision: bool = True
     object_indices: tuple[tuple[int, ...], ...] = ()
     tactics: tuple[float, ...] = (0.0,)
+    long_chain: bool = True
     action_cost: float = 1.0
     version: int = 1
 

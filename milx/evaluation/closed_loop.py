@@ -3,7 +3,6 @@
 One adaptation per task, on a demonstration whose own scene is never a trial scene; then trials in fresh scenes.
 """
 
-import dataclasses
 import functools
 import math
 from typing import Any, NamedTuple
@@ -13,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from milx.config.schema import Config, DataConfig, EvalConfig
-from milx.core import parallel
+from milx.core import parallel, platform
 from milx.core.batching import map_in_chunks, map_in_groups
 from milx.data.simulated import DemoSet, render_demo, shapes
 from milx.envs.base import Env, State, Task
@@ -24,10 +23,10 @@ from milx.methods.base import Method
 from milx.methods.random import Random
 from milx.trajopt.expert import choose_tactics, judge, perform
 from milx.trajopt.ilqr import Options
-from milx.types import Demo, Params, TaskBatch, TaskParams
+from milx.types import Demo, Params, TaskParams
 
 _LISTENERS = 24
-"""Held-out tasks on which `listen` measures, at most."""
+"""Maximum number of held-out tasks on which `listen` measures."""
 _PIXELS = 64_000_000
 """Pixels of demonstrations that a device adapts to at once: an inner step keeps all activations for its gradient."""
 
@@ -54,34 +53,33 @@ class Trials(NamedTuple):
     states: State
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1))
-def _run_batch(
-    env: Env,
-    method: Method,
-    params: Params,
-    task: Task,
-    shown: Task,
-    states: State,
-    action: jax.Array,
-    scene: State,
-    key: jax.Array,
-) -> Trials:
-    """Adapts to demonstrations [N, K, T, ...] of tasks `shown`, then lets the policy act from scenes [N, trials]."""
+@functools.cache
+def _adaptation(env: Env, method: Method) -> Any:
+    """Makes the program that adapts to demonstrations of N tasks: `states` and `action` have axes [N, K, T, ...]."""
 
-    def run_tasks(
-        params: Params, task: Task, shown: Task, states: State, action: jax.Array, scene: State, key: jax.Array
-    ) -> Trials:
+    def adapt_tasks(params: Params, task: Task, states: State, action: jax.Array) -> TaskParams:
         def adapt(task: Task, states: State, action: jax.Array) -> TaskParams:
             return method.adapt(params, jax.vmap(functools.partial(render_demo, env, task))(states, action))
 
+        return map_in_groups(adapt, (task, states, action), _tasks_at_once(env, action))
+
+    adapt_shards = functools.wraps(adapt_tasks)(parallel.shard_tasks(adapt_tasks, shared=1))
+    return jax.jit(adapt_shards, compiler_options=platform.pixel_options())
+
+
+@functools.cache
+def _acting(env: Env, method: Method) -> Any:
+    """Makes the program in which the policies of N tasks act from scenes [N, trials]."""
+
+    def run_tasks(task_params: TaskParams, task: Task, scene: State, key: jax.Array) -> Trials:
         def trial(task_params: TaskParams, task: Task, scene: State, key: jax.Array) -> Trials:
             visited, _ = rollout(env, method, task_params, task, scene, key)
             return Trials(env.success(task, visited), env.other_criteria(task, visited), visited)
 
-        task_params = map_in_groups(adapt, (shown, states, action), _tasks_at_once(env, action))
         return jax.vmap(jax.vmap(trial, in_axes=(None, None, 0, 0)))(task_params, task, scene, key)
 
-    return parallel.shard_tasks(run_tasks, shared=1)(params, task, shown, states, action, scene, key)
+    run_shards = functools.wraps(run_tasks)(parallel.shard_tasks(run_tasks))
+    return jax.jit(run_shards, compiler_options={} if env.long_chain else platform.pixel_options())
 
 
 def _tasks_at_once(env: Env, action: jax.Array) -> int:
@@ -121,32 +119,44 @@ def run_trials(
     support = jax.tree.map(lambda x: x[:, : config.shots], (shown.states, shown.action))
     keys = jax.random.split(act_key, (demos.num_tasks, config.trials))
     scene, keys = jax.tree.map(lambda x: x[:, :first], (scene, keys))
-    inputs = (demos.task, shown.task, *support, scene, keys)
-    return map_in_chunks(functools.partial(_run_batch, env, method, params), inputs, config.batch)
+
+    def run(task: Task, shown: Task, states: State, action: jax.Array, scene: State, keys: jax.Array) -> Trials:
+        task_params = _adaptation(env, method)(params, shown, states, action)
+        return _acting(env, method)(task_params, task, scene, keys)
+
+    return map_in_chunks(run, (demos.task, shown.task, *support, scene, keys), config.batch)
 
 
-def precompile(env: Env, method: Method, params: Params, config: EvalConfig, first: int | None = None) -> None:
-    """Compiles what `run_trials` runs, into the compilation cache; `params` may be shapes."""
-    size, trials = parallel.round_up(config.batch), min(config.trials, first or config.trials)
+def precompile(env: Env, method: Method, params: Params, config: EvalConfig, trials: tuple[int, ...]) -> None:
+    """Compiles what `run_trials` runs, for several numbers of trials, into the compilation cache.
+
+    `params` may be shapes.
+    """
+    size = parallel.round_up(config.batch)
     batch = shapes(env, size, config.shots)
-    keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), (size, trials)))
-    scene = jax.eval_shape(lambda task: trial_scenes(env, task, jax.random.key(0), trials), batch.task)
-    shown = batch.task, batch.states, batch.action
-    _run_batch.lower(env, method, params, batch.task, *shown, scene, keys).compile()
+    adaptation = _adaptation(env, method)
+    shown = params, batch.task, batch.states, batch.action
+    adaptation.lower(*shown).compile()
+    task_params = parallel.as_result(jax.eval_shape(adaptation, *shown))
+    for count in trials:
+        keys = jax.eval_shape(lambda count=count: jax.random.split(jax.random.key(0), (size, count)))
+        scene = jax.eval_shape(lambda task, count=count: trial_scenes(env, task, jax.random.key(0), count), batch.task)
+        _acting(env, method).lower(task_params, batch.task, scene, keys).compile()
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1, 4))
-def _listen(env: Env, method: Method, params: Params, demos: DemoSet, shots: int) -> dict[str, jax.Array]:
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _compare(env: Env, method: Method, params: Params, adapted: TaskParams, demos: DemoSet) -> dict[str, jax.Array]:
+    """Measures `listening.compare` on the first demonstration of each of N tasks."""
+
     def render(task: Task, states: State, action: jax.Array) -> Demo:
         return jax.vmap(functools.partial(render_demo, env, task))(states, action)
 
-    shown = parallel.shard_tasks(jax.vmap(render))(demos.task, demos.states, demos.action)
-    batch = TaskBatch(jax.tree.map(lambda x: x[:, :shots], shown), jax.tree.map(lambda x: x[:, shots:], shown))
-    return listening.measure(method, params, batch, _tasks_at_once(env, demos.action[:, :shots]))
+    query = parallel.shard_tasks(jax.vmap(render))(demos.task, demos.states, demos.action)
+    return listening.compare(method, params, adapted, query, _tasks_at_once(env, demos.action))
 
 
-def listen(env: Env, method: Method, params: Params, demos: DemoSet, shots: int) -> dict[str, float]:
-    """Measures `listening.measure` on held-out tasks: adapts to `shots` demonstrations and asks for the next one's.
+def listen(env: Env, method: Method, params: Params, demos: DemoSet, config: EvalConfig) -> dict[str, float]:
+    """Measures `listening.compare` on held-out tasks: adapts to their first demonstrations, asks for the next one's.
 
     Nothing where there are fewer than two tasks, or fewer tasks than devices.
     """
@@ -154,11 +164,14 @@ def listen(env: Env, method: Method, params: Params, demos: DemoSet, shots: int)
     if count < 2:
         return {}
     chosen = jax.tree.map(lambda x: x[:count], demos)
-    states = jax.tree.map(lambda x: x[:, : shots + 1], chosen.states)
-    chosen = dataclasses.replace(
-        chosen, states=states, action=chosen.action[:, : shots + 1], success=chosen.success[:, : shots + 1]
+    support, query = (
+        jax.tree.map(lambda x, part=part: x[:, part], (chosen.states, chosen.action, chosen.success))
+        for part in (slice(config.shots), slice(config.shots, config.shots + 1))
     )
-    return {name: float(value) for name, value in _listen(env, method, params, chosen, shots).items()}
+    adapt = functools.partial(_adaptation(env, method), params)
+    adapted = map_in_chunks(adapt, (chosen.task, *support[:2]), config.batch, counted=False)
+    found = _compare(env, method, params, adapted, DemoSet(chosen.task, *query))
+    return {name: float(value) for name, value in found.items()}
 
 
 def _listeners(num_tasks: int) -> int:
@@ -166,10 +179,13 @@ def _listeners(num_tasks: int) -> int:
     return min(num_tasks, _LISTENERS) // parallel.num_devices() * parallel.num_devices()
 
 
-def precompile_listen(env: Env, method: Method, params: Params, num_tasks: int, shots: int) -> None:
-    """Compiles what `listen` runs on so many tasks, into the compilation cache; `params` may be shapes."""
-    if (count := _listeners(num_tasks)) >= 2:
-        _listen.lower(env, method, params, shapes(env, count, shots + 1), shots).compile()
+def precompile_listen(env: Env, method: Method, params: Params, config: EvalConfig) -> None:
+    """Compiles what `listen` runs after an adaptation, into the compilation cache; `params` may be shapes."""
+    if (count := _listeners(config.validation_tasks)) >= 2:
+        support, query = shapes(env, count, config.shots), shapes(env, count, 1)
+        shown = params, support.task, support.states, support.action
+        adapted = parallel.as_result(jax.eval_shape(_adaptation(env, method), *shown))
+        _compare.lower(env, method, params, adapted, query).compile()
 
 
 class Baselines(NamedTuple):

@@ -105,7 +105,7 @@ def validation_of(
         The success rate in their trials, and what `listening.measure` finds there.
     """
     trials = closed_loop.run_trials(env, method, params, demos, config, trial_key("validation"))
-    return float(trials.success.mean()), closed_loop.listen(env, method, params, demos, config.shots)
+    return float(trials.success.mean()), closed_loop.listen(env, method, params, demos, config)
 
 
 def result_of(
@@ -207,12 +207,14 @@ class SimulatedRun(Run):
 
     def _precompile(self, params: Params) -> list[Callable[[], None]]:
         config, random = self.config.evaluation, Random(self.env.action_size)
-        precompile = functools.partial(closed_loop.precompile, self.env)
-        fewer = [config.baseline_trials] if config.baseline_trials < config.trials else []
+        precompile, fewer = (
+            functools.partial(closed_loop.precompile, self.env),
+            min(config.baseline_trials, config.trials),
+        )
         return [
-            *(functools.partial(precompile, self.method, params, config, first) for first in (None, *fewer)),
-            functools.partial(precompile, random, {}, config, config.baseline_trials),
-            lambda: closed_loop.precompile_listen(self.env, self.method, params, config.validation_tasks, config.shots),
+            lambda: precompile(self.method, params, config, tuple({config.trials, fewer})),
+            lambda: precompile(random, {}, config, (fewer,)),
+            lambda: closed_loop.precompile_listen(self.env, self.method, params, config),
             lambda: closed_loop.precompile_film(self._large, min(config.tasks, _FILMED)),
         ]
 

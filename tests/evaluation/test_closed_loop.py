@@ -1,6 +1,7 @@
 """Wilson's interval, which scenes are tried, and that the size of a batch changes nothing."""
 
 import dataclasses
+import functools
 import types
 
 import jax
@@ -116,11 +117,8 @@ def test_so_many_tasks_are_adapted_at_once_as_share_the_pixels(shots, pixels, at
 def test_no_trial_takes_place_in_the_demonstration_s_scene(trained, split, monkeypatch):
     demos = getattr(trained, split)
     # What a trial is given: its scene, and the demonstration that the policy adapts to.
-    monkeypatch.setattr(
-        closed_loop,
-        "_run_batch",
-        lambda env, method, params, task, shown, states, action, scene, key: (scene, states, action),
-    )
+    monkeypatch.setattr(closed_loop, "_adaptation", lambda *_: lambda params, task, states, action: (states, action))
+    monkeypatch.setattr(closed_loop, "_acting", lambda *_: lambda seen, task, scene, key: (scene, *seen))
     config = dataclasses.replace(trained.config.evaluation, trials=10)
     key = simulated.trial_key(split)
     scene, states, action = closed_loop.run_trials(trained.run.env, trained.run.method, (), demos, config, key)
@@ -164,16 +162,22 @@ def test_baselines_run_in_the_first_trials(trained, monkeypatch, trials, asked, 
     assert rates["expert"] == rates["task_blind"] == pytest.approx(rate)
 
 
+def compiled(caplog, *names):
+    """Tells which of these functions have been compiled since it was last called."""
+    found = [f"XLA compilation of jit({name})" in caplog.text for name in names]
+    caplog.clear()
+    return found
+
+
 def test_programs_compiled_ahead_are_found(trained, caplog):
     method, config = Replay(), dataclasses.replace(trained.config.evaluation, trials=4)
-    compiled = []
+    names, run = ("adapt_tasks", "run_tasks"), functools.partial(closed_loop.run_trials, trained.run.env, method, ())
     with jax.log_compiles():
-        closed_loop.precompile(trained.run.env, method, (), config)
-        compiled.append("XLA compilation of jit(_run_batch)" in caplog.text)
-        caplog.clear()
-        closed_loop.run_trials(trained.run.env, method, (), trained.test, config, jax.random.key(0))
-        compiled.append("XLA compilation of jit(_run_batch)" in caplog.text)
-    assert compiled == [True, False]
+        closed_loop.precompile(trained.run.env, method, (), config, (4, 1))
+        assert compiled(caplog, *names) == [True, True]
+        run(trained.test, config, jax.random.key(0))
+        run(trained.test, config, jax.random.key(0), first=1)
+        assert compiled(caplog, *names) == [False, False]
 
 
 def test_listening_and_filming_find_their_programs_compiled(trained, caplog):
@@ -182,20 +186,15 @@ def test_listening_and_filming_find_their_programs_compiled(trained, caplog):
     whitening = Whitening(*(jnp.full(n, v) for n in (8, 2) for v in (0.0, 1.0)))
     params = method.init(jax.random.key(0), whitening)
     first = jax.tree.map(lambda x: jnp.asarray(x[:, 0]), trained.validation.states)
-    compiled = []
-
-    def note():
-        compiled.append([f"XLA compilation of jit({name})" in caplog.text for name in ("_listen", "film")])
-        caplog.clear()
-
+    names = ("adapt_tasks", "_compare", "film")
     with jax.log_compiles():
-        closed_loop.precompile_listen(trained.run.env, method, params, 3, config.shots)
+        closed_loop.precompile(trained.run.env, method, params, config, ())
+        closed_loop.precompile_listen(trained.run.env, method, params, config)
         closed_loop.precompile_film(env, 3)
-        note()
-        closed_loop.listen(trained.run.env, method, params, trained.validation, config.shots)
+        assert compiled(caplog, *names) == [True, True, True]
+        closed_loop.listen(trained.run.env, method, params, trained.validation, config)
         closed_loop.film(env, trained.validation.task, first)
-        note()
-    assert compiled == [[True, True], [False, False]]
+        assert compiled(caplog, *names) == [False, False, False]
 
 
 def test_validation_and_test_trials_differ(trained):

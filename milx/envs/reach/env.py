@@ -55,6 +55,7 @@ class Reach(Env[ReachTask]):
     criterion = f"fingertip within {TOUCH} m of the target in one of the last {LAST_STEPS} of 50 steps"
     state_size = 8
     goal_indices = (4, 5)
+    long_chain = False
     action_cost = 4.0
     version = 2
 
