@@ -262,3 +262,34 @@ def test_unknown_names_are_told_the_known_ones(env):
         env.sample_task(jax.random.key(0), "trian")
     with pytest.raises(ValueError, match="env: got 'nope', expected one of reach"):
         milx.make("nope")
+
+
+def test_postures_bring_the_fingertip_over_the_cubes(env, task):
+    """The arm reaches from 0.21 - 0.2 to 0.21 m; a cube nearer or farther is as near as the arm can come to it."""
+    states = jax.vmap(env.reset, in_axes=(0, None))(jax.random.split(jax.random.key(5), 500), task)
+    cubes = np.asarray(states.mocap_pos[..., :2])
+    tip = np.asarray(jax.vmap(jax.vmap(env.fingertip))(jax.vmap(env._posture)(states)))
+    distance = np.linalg.norm(cubes, axis=-1)
+    beyond = np.maximum(np.maximum(distance - 0.21, 0.01 - distance), 0)
+    np.testing.assert_allclose(np.linalg.norm(tip - cubes, axis=-1), beyond, rtol=0, atol=1e-7)
+
+
+def test_the_guess_ends_at_the_target_under_c_mujoco(env):
+    """Within 1 cm, in every scene whose target is within reach."""
+    tasks = jax.vmap(lambda key: env.sample_task(key, "train"))(jax.random.split(jax.random.key(6), 40))
+    starts = jax.vmap(env.reset)(jax.random.split(jax.random.key(7), 40), tasks)
+    guesses = np.asarray(jax.jit(jax.vmap(env.guess))(tasks, starts))
+    model, tried = env.mj_model, 0
+    data, tip = mujoco.MjData(model), model.site("fingertip").id
+    for number, guess in enumerate(guesses):
+        target = np.asarray(starts.mocap_pos[number, tasks.target[number], :2])
+        if not 0.01 < np.linalg.norm(target) < 0.21:
+            continue
+        mujoco.mj_resetData(model, data)
+        for ctrl in guess:
+            data.ctrl[:] = ctrl
+            mujoco.mj_step(model, data, nstep=env.substeps)
+        mujoco.mj_forward(model, data)
+        assert np.linalg.norm(data.site_xpos[tip, :2] - target) < 0.01, number
+        tried += 1
+    assert tried > 20

@@ -91,6 +91,7 @@ class Place(Env[PlaceTask]):
     criterion = "the thing comes to rest in or on the target container once the hand has opened"
     state_size = 16
     goal_indices = (7, 8)
+    long_chain = False
     version = 2
 
     def __init__(self, image_shape: tuple[int, int] | None = None):

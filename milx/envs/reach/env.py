@@ -23,6 +23,8 @@ LAST_STEPS = 10
 # Color grids {offset, offset + 0.1, ...}^3 of the splits: disjoint, so that test and validation colors are held out.
 COLOR_OFFSETS = {"train": 0.0, "validation": 0.025, "test": 0.05}
 VELOCITY_COST = 0.02
+_LEVER = 0.12
+"""How far the fingertip moves when a joint turns, for the planner's guess (m/rad)."""
 _CANDIDATES = 64
 
 
@@ -57,7 +59,7 @@ class Reach(Env[ReachTask]):
     goal_indices = (4, 5)
     long_chain = False
     action_cost = 4.0
-    version = 2
+    version = 3
 
     def __init__(self, image_shape: tuple[int, int] | None = None):
         super().__init__(mujoco.MjModel.from_xml_path(str(ASSETS / "reach.xml")), image_shape)
@@ -154,6 +156,42 @@ class Reach(Env[ReachTask]):
     def terminal_residual(self, task: ReachTask, state: State) -> jax.Array:
         """Returns [4]: from the target to the fingertip (m) and joint velocities, weighted."""
         return jnp.concatenate([5.0 * self.off_target(task, state), VELOCITY_COST * state.qvel])
+
+    def guess(self, task: ReachTask, state: State) -> jax.Array:
+        """Turns both joints to the nearer of the two postures over the target: [T, 2].
+
+        Each joint counts as an inertia j, the armature, driven by g u, with its damping. The regulator that minimizes
+        the integral of (l (q - q*))^2 + (a u)^2 without damping has the gains l / a and sqrt(2 j l / (a g)).
+        """
+        low, high = self.action_range
+        model, goal = self.mj_model, self._posture(state)[task.target]
+        inertia, damping, gear = model.dof_armature[:2], model.dof_damping[:2], model.actuator_gear[:, 0]
+        stiffness = _LEVER / self.action_cost
+        brake = np.sqrt(2 * inertia * stiffness / gear)
+        h = self.substeps * model.opt.timestep
+
+        def step(carry: tuple, _: None) -> tuple[tuple, jax.Array]:
+            qpos, qvel = carry
+            ctrl = jnp.clip(stiffness * (goal - qpos) - brake * qvel, low, high)
+            qvel = qvel + h * (gear * ctrl - damping * qvel) / inertia
+            return (qpos + h * qvel, qvel), ctrl
+
+        return jax.lax.scan(step, (state.qpos, state.qvel), length=self.horizon)[1]
+
+    def _posture(self, state: State) -> jax.Array:
+        """Returns joint angles [3, 2] (rad) that bring the fingertip over each cube, or as near as the arm reaches.
+
+        Of the two solutions, elbow to the left and to the right, the nearer one to the present angles.
+        """
+        x, y = state.mocap_pos[:, :2].T
+        upper, lower = jnp.linalg.norm(self._links, axis=-1)
+        cosine = (x**2 + y**2 - upper**2 - lower**2) / (2 * upper * lower)
+        elbow = jnp.arccos(jnp.clip(cosine, -1, 1))[:, None] * jnp.array([1.0, -1.0])
+        ahead = jnp.arctan2(lower * jnp.sin(elbow), upper + lower * jnp.cos(elbow))
+        shoulder = (jnp.arctan2(y, x)[:, None] - ahead + jnp.pi) % (2 * jnp.pi) - jnp.pi
+        postures = jnp.stack([shoulder, elbow], axis=-1)
+        nearer = jnp.argmin(jnp.square(postures - state.qpos).sum(axis=-1), axis=-1)
+        return postures[jnp.arange(len(nearer)), nearer]
 
     def success(self, task: ReachTask, states: State) -> jax.Array:
         """Tells whether the fingertip touched the target in one of the last LAST_STEPS steps (paper, Appendix A)."""

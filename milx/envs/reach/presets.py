@@ -30,7 +30,7 @@ _SMALL = _FAST | {
     "env.image_shape": (32, 40),
     "data.tasks": 300,
     "data.demos_per_task": 5,
-    "data.plan_iterations": 8,
+    "data.plan_iterations": 4,
     "data.plan_batch": 100,
     "network.filters": (32, 32, 32),
     "network.fc_layers": (100, 100, 100),
@@ -48,9 +48,10 @@ _SMALL = _FAST | {
 _CPU = _SMALL | {
     "optimizer.name": "muon",
     "method.sharpness": 4.0,
-    "train.steps": 6000,
+    "train.steps": 4000,
     "train.query_frames": 4,
-    "train.eval_every": 3000,
+    "train.frame_exponent": 2.0,
+    "train.eval_every": 2000,
 }
 
 REACH: dict[str, Overrides] = {"paper": _PAPER, "fast": _FAST, "cpu": _CPU}
