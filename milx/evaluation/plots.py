@@ -1,14 +1,16 @@
 """Plots and videos of a run."""
 
 import pathlib
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import imageio.v3 as iio
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from milx.evaluation import listening
+
+if TYPE_CHECKING:  # importing matplotlib takes half a second, which no run should wait for before its first line
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 
 def learning_curve(metrics: list[dict[str, Any]], evaluation: dict[str, Any], path: pathlib.Path) -> None:
@@ -19,7 +21,7 @@ def learning_curve(metrics: list[dict[str, Any]], evaluation: dict[str, Any], pa
         evaluation: the run's evaluation.json.
         path: image file to write.
     """
-    figure = Figure(figsize=(14, 3.6), layout="constrained")
+    figure = _figure(14)
     left, middle, right = figure.subplots(1, 3)
     _listening(left, metrics)
     if any("goal_loss" in line for line in metrics):
@@ -48,7 +50,14 @@ def learning_curve(metrics: list[dict[str, Any]], evaluation: dict[str, Any], pa
     figure.savefig(path, dpi=120)
 
 
-def _listening(axis: Axes, metrics: list[dict[str, Any]]) -> None:
+def _figure(width: float) -> "Figure":
+    """Makes a figure so wide (inches)."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, 3.6), layout="constrained")
+
+
+def _listening(axis: "Axes", metrics: list[dict[str, Any]]) -> None:
     """Plots the errors of `listening.measure`: on training tasks as lines, on validation tasks as dots."""
     axis.set(xlabel="meta-updates", ylabel="squared error of the actions (1: a constant)", title="does it listen?")
     for (name, words), color in zip(listening.ERRORS.items(), ("tab:blue", "tab:orange", "0.6"), strict=True):
@@ -74,7 +83,7 @@ def action_errors(metrics: list[dict[str, Any]], evaluation: dict[str, Any], pat
         evaluation: the run's evaluation.json.
         path: image file to write.
     """
-    figure = Figure(figsize=(10, 3.6), layout="constrained")
+    figure = _figure(10)
     left, middle, right = figure.subplots(1, 3)
     _listening(left, metrics)
     middle.plot(*_curve(metrics, "validation_score"), "-o", lw=1)

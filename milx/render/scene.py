@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 from milx.core.mjx import mjx
-from milx.render import kernel, raycast, shade, textures
+from milx.render import raycast, shade, textures
 from milx.render.textures import Textures
 
 _DIRECTIONAL = int(mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
@@ -171,6 +171,8 @@ class Renderer:
 
     def paint(self, scene: Scene, interpret: bool = False) -> jax.Array:
         """Draws the image in one kernel of a GPU, without shadows; `interpret` runs the kernel anywhere, slowly."""
+        from milx.render import kernel  # Pallas takes a quarter of a second to import
+
         texture = None if scene.texture is None else _in_camera(scene.texture, scene)
         geoms = kernel.geom_table(self._model.geom_type, _geometry(scene), scene.geom_rgba, self._materials, texture)
         order: list[int] = []
