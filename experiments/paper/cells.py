@@ -13,6 +13,7 @@ import pathlib
 import shutil
 import time
 from collections.abc import Callable
+from concurrent.futures import Future
 from typing import Any, NamedTuple
 
 import jax
@@ -22,7 +23,7 @@ from milx import envs, methods
 from milx.config import assemble
 from milx.config.assemble import make_config
 from milx.config.schema import Config
-from milx.core import platform, pytrees
+from milx.core import pytrees
 from milx.core.checkpoint import Checkpoints
 from milx.data import simulated as demos_lib
 from milx.data.simulated import DemoSet
@@ -31,7 +32,7 @@ from milx.training import loop, signals
 from milx.training.metrics import MetricsWriter, read_metrics
 from milx.training.simulated import demos_of_split, result_of, training_on, trial_key, validation_of
 from milx.training.state import Training, check_steps, initial_state, restore_state, save_state
-from milx.training.update import Trainer, TrainState, make_optimizer
+from milx.training.update import Trainer, TrainState, compile_in_background, make_optimizer
 from milx.types import Params
 
 METHODS = {
@@ -150,6 +151,7 @@ class Cells:
 
     def _run(self, name: str, config: Config) -> dict[str, Any]:
         clock = [time.perf_counter()]
+        self._compiling(config)  # while demonstrations are planned
         env, method, evaluation = self._env(config), self._trainer(config).method, config.evaluation
         train, test = self._first_tasks(config), self._demos(config, "test")
         baselines = self._once(
@@ -223,12 +225,8 @@ class Cells:
             state, clock.seconds = restore_state(checkpoints, checkpoints.latest, state, training.dataset_hash)
             print(f"  {name}: goes on from step {int(state.step)}", flush=True)
 
-        def compile_scan() -> Any:
-            lowered = Trainer.run.lower(trainer, state, training.at(0), key, config.train.log_every)
-            return lowered.compile(platform.pixel_options())
-
         with clock("compile"):
-            scan = self._once(("compiled", self._programs(config)), compile_scan)
+            scan = self._compiling(config).result()
 
         def validate(state: TrainState) -> float:
             step = int(state.step)
@@ -261,6 +259,22 @@ class Cells:
         method = methods.make(config, env.spec)
         make = lambda: Trainer(demos_lib.sampler(env, config.train), method, config.train, optimizer)  # noqa: E731
         return self._once(("trainer", self._programs(config)), make)
+
+    def _compiling(self, config: Config) -> Future[Callable[..., Any]]:
+        """Compiles what trains and validates a cell, in the background."""
+
+        def start() -> Future[Callable[..., Any]]:
+            env, trainer = self._env(config), self._trainer(config)
+            params = methods.params_like(trainer.method, env.spec)
+            validation = dataclasses.replace(config.evaluation, shots=config.train.shots)
+            then = (
+                lambda: closed_loop.precompile(env, trainer.method, params, validation, (validation.trials,)),
+                lambda: closed_loop.precompile_listen(env, trainer.method, params, validation),
+            )
+            data = demos_lib.shapes(env, self.capacity, config.data.demos_per_task)
+            return compile_in_background(trainer, params, data, config.train.log_every, then)
+
+        return self._once(("compiled", self._programs(config)), start)
 
     def _env(self, config: Config) -> envs.Env:
         world = config.env_name, config.env.image_shape, config.env.action_cost

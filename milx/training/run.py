@@ -14,19 +14,17 @@ import contextlib
 import pathlib
 import tempfile
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from typing import Any
 
 import jax
-import numpy as np
 import rich.markup
 from rich.console import Console
 
 from milx import methods
 from milx.config import assemble
 from milx.config.schema import Config, ConvConfig
-from milx.core import parallel, platform, progress
+from milx.core import parallel, progress
 from milx.core.checkpoint import UNVALIDATED, Checkpoints
 from milx.evaluation import listening, results
 from milx.methods import params_like
@@ -34,7 +32,7 @@ from milx.networks import fixed_filters
 from milx.training import loop, signals
 from milx.training.metrics import MetricsWriter
 from milx.training.state import Training, check_steps, initial_state, restore_state, save_state
-from milx.training.update import Sample, Trainer, TrainState, make_optimizer
+from milx.training.update import Sample, Trainer, TrainState, compile_in_background, make_optimizer
 from milx.types import Params, Spec
 
 
@@ -137,7 +135,9 @@ class Run(abc.ABC):
                 return
             if isinstance(network, ConvConfig) and network.fixed_filters not in (None, fixed_filters.KMEANS):
                 fixed_filters.read_filters(network.fixed_filters, network)  # refuses a bad file before planning
-            compiled = self._compile_in_background()
+            params = self._params_like
+            others = self._precompile(params)
+            compiled = compile_in_background(self.trainer, params, self._shapes(), config.log_every, others)
             training = self._load()
             state, key = self._start(training, checkpoints)
             with self.clock("compile"), self.phase("compiling the training program"):
@@ -223,25 +223,6 @@ class Run(abc.ABC):
     @property
     def _params_like(self) -> Params:
         return params_like(self.method, self.spec)
-
-    def _compile_in_background(self) -> Future[Callable[..., Any]]:
-        """Compiles the scan of meta-updates, and more, from shapes alone, while demonstrations are planned or read."""
-        params = self._params_like
-        state = TrainState(
-            jax.ShapeDtypeStruct((), np.int32), params, jax.eval_shape(self.trainer.optimizer.init, params)
-        )
-        data, steps = self._shapes(), self.config.train.log_every
-
-        def compile_step() -> Callable[..., Any]:
-            lowered = Trainer.run.lower(self.trainer, state, data, jax.random.key(0), steps)
-            return lowered.compile(platform.pixel_options())
-
-        thread = ThreadPoolExecutor(max_workers=1)  # tracing holds Python's lock: more would slow the planner's down
-        compiled = thread.submit(compile_step)
-        for compile_more in self._precompile(params):
-            thread.submit(compile_more)
-        thread.shutdown(wait=False)
-        return compiled
 
     def _start(self, training: Training, checkpoints: Checkpoints) -> tuple[TrainState, jax.Array]:
         """Returns the state to train from, and the key of the batches."""

@@ -7,16 +7,18 @@ last checkpoint.
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 import optax.contrib
 
 from milx.config.schema import OPTIMIZERS, OptimizerConfig, TrainConfig
-from milx.core import parallel
+from milx.core import parallel, platform
 from milx.core.batching import map_in_groups
 from milx.evaluation import listening
 from milx.methods.base import Method
@@ -195,3 +197,35 @@ class Trainer:
             "skipped": skipped,
             "bad_task": bad_task,
         }
+
+
+def compile_in_background(
+    trainer: Trainer, params: Params, data: Any, steps: int, then: Iterable[Callable[[], None]] = ()
+) -> Future[Callable[..., Any]]:
+    """Compiles `Trainer.run` from shapes alone while the caller does something else, then calls each of `then`.
+
+    One after the other: tracing holds Python's lock, so that more threads would slow the caller's tracing down.
+
+    Args:
+        trainer: what is to run.
+        params: shapes of the method's parameters.
+        data: shapes of what `run` draws its batches from.
+        steps: meta-updates of a scan.
+        then: functions that compile other programs.
+
+    Returns:
+        The future program, a function of a state, data and a key.
+    """
+    optimizer = jax.eval_shape(trainer.optimizer.init, params)
+    state = TrainState(jax.ShapeDtypeStruct((), np.int32), params, optimizer)
+
+    def compile_run() -> Callable[..., Any]:
+        lowered = Trainer.run.lower(trainer, state, data, jax.random.key(0), steps)
+        return lowered.compile(platform.pixel_options())
+
+    thread = ThreadPoolExecutor(max_workers=1)
+    compiled = thread.submit(compile_run)
+    for compile_more in then:
+        thread.submit(compile_more)
+    thread.shutdown(wait=False)
+    return compiled
