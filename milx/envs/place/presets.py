@@ -83,5 +83,5 @@ PLACE: dict[str, Overrides] = {"paper": _PAPER, "fast": _FAST, "cpu": _CPU}
 PLACE_DURATIONS = {
     "paper": "18 minutes on an H100",
     "fast": "6.6 minutes on an H200 that another run used, too",
-    "cpu": "13 minutes on two CPU cores",
+    "cpu": "10 minutes on two CPU cores",
 }

@@ -82,5 +82,5 @@ PUSH: dict[str, Overrides] = {"paper": _PAPER, "fast": _FAST, "cpu": _CPU}
 PUSH_DURATIONS = {
     "paper": "14 minutes on an H200 that another run used, too",
     "fast": "15 minutes on an H200 that others used, too",
-    "cpu": "62 minutes on two CPU cores",
+    "cpu": "16 minutes on two CPU cores",
 }

@@ -58,7 +58,7 @@ REACH: dict[str, Overrides] = {"paper": _PAPER, "fast": _FAST, "cpu": _CPU}
 REACH_DURATIONS = {
     "paper": "9 to 12 minutes on an H200 that another run used, too",
     "fast": "4.5 minutes on an H200",
-    "cpu": "6 minutes on two CPU cores",
+    "cpu": "4 minutes on two CPU cores",
 }
 REACH_STATE: dict[str, Overrides] = {
     "paper": _PAPER | WITHOUT_PIXELS,
