@@ -5,6 +5,7 @@ One adaptation per task, on a demonstration whose own scene is never a trial sce
 
 import functools
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -127,7 +128,7 @@ def run_trials(
     return map_in_chunks(run, (demos.task, shown.task, *support, scene, keys), config.batch)
 
 
-def precompile(env: Env, method: Method, params: Params, config: EvalConfig, trials: tuple[int, ...]) -> None:
+def precompile(env: Env, method: Method, params: Params, config: EvalConfig, trials: Sequence[int]) -> None:
     """Compiles what `run_trials` runs, for several numbers of trials, into the compilation cache.
 
     `params` may be shapes.

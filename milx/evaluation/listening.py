@@ -61,9 +61,9 @@ def compare(method: Method, params: Params, adapted: TaskParams, query: Demo, mo
         policies["no_demo"] = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), prior)
 
     def error(task_params: TaskParams, query: Demo) -> jax.Array:
-        return map_in_groups(functools.partial(_squared_error, method), (task_params, query), most)
+        return map_in_groups(functools.partial(_squared_error, method), (task_params, query), min(most, count))
 
-    # All at once: one copy of the network in the program instead of three.
+    # In one call: one copy of the network in the program instead of three.
     every = jax.tree.map(lambda *xs: jnp.concatenate(xs), *policies.values())
     asked = jax.tree.map(lambda x: jnp.concatenate([x] * len(policies)), query)
     errors = parallel.shard_tasks(error)(every, asked).reshape(len(policies), count, -1)

@@ -206,15 +206,12 @@ class SimulatedRun(Run):
         return demos_lib.shapes(self.env, self.config.data.tasks, self.config.data.demos_per_task)
 
     def _precompile(self, params: Params) -> list[Callable[[], None]]:
-        config, random = self.config.evaluation, Random(self.env.action_size)
-        precompile, fewer = (
-            functools.partial(closed_loop.precompile, self.env),
-            min(config.baseline_trials, config.trials),
-        )
+        env, config, random = self.env, self.config.evaluation, Random(self.env.action_size)
+        fewer = min(config.baseline_trials, config.trials)
         return [
-            lambda: precompile(self.method, params, config, tuple({config.trials, fewer})),
-            lambda: precompile(random, {}, config, (fewer,)),
-            lambda: closed_loop.precompile_listen(self.env, self.method, params, config),
+            lambda: closed_loop.precompile(env, self.method, params, config, sorted({config.trials, fewer})),
+            lambda: closed_loop.precompile(env, random, {}, config, [fewer]),
+            lambda: closed_loop.precompile_listen(env, self.method, params, config),
             lambda: closed_loop.precompile_film(self._large, min(config.tasks, _FILMED)),
         ]
 

@@ -268,7 +268,8 @@ def test_postures_bring_the_fingertip_over_the_cubes(env, task):
     """The arm reaches from 0.21 - 0.2 to 0.21 m; a cube nearer or farther is as near as the arm can come to it."""
     states = jax.vmap(env.reset, in_axes=(0, None))(jax.random.split(jax.random.key(5), 500), task)
     cubes = np.asarray(states.mocap_pos[..., :2])
-    tip = np.asarray(jax.vmap(jax.vmap(env.fingertip))(jax.vmap(env._posture)(states)))
+    postures = jax.vmap(jax.vmap(env._posture, in_axes=(None, 0)))(states.qpos, cubes)
+    tip = np.asarray(jax.vmap(jax.vmap(env.fingertip))(postures))
     distance = np.linalg.norm(cubes, axis=-1)
     beyond = np.maximum(np.maximum(distance - 0.21, 0.01 - distance), 0)
     np.testing.assert_allclose(np.linalg.norm(tip - cubes, axis=-1), beyond, rtol=0, atol=1e-7)

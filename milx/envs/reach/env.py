@@ -158,13 +158,14 @@ class Reach(Env[ReachTask]):
         return jnp.concatenate([5.0 * self.off_target(task, state), VELOCITY_COST * state.qvel])
 
     def guess(self, task: ReachTask, state: State) -> jax.Array:
-        """Turns both joints to the nearer of the two postures over the target: [T, 2].
+        """Turns both joints to the nearer of the two postures in which `off_target` is zero: [T, 2].
 
         Each joint counts as an inertia j, the armature, driven by g u, with its damping. The regulator that minimizes
         the integral of (l (q - q*))^2 + (a u)^2 without damping has the gains l / a and sqrt(2 j l / (a g)).
         """
         low, high = self.action_range
-        model, goal = self.mj_model, self._posture(state)[task.target]
+        model = self.mj_model
+        goal = self._posture(state.qpos, self.fingertip(state.qpos) - self.off_target(task, state))
         inertia, damping, gear = model.dof_armature[:2], model.dof_damping[:2], model.actuator_gear[:, 0]
         stiffness = _LEVER / self.action_cost
         brake = np.sqrt(2 * inertia * stiffness / gear)
@@ -178,20 +179,19 @@ class Reach(Env[ReachTask]):
 
         return jax.lax.scan(step, (state.qpos, state.qvel), length=self.horizon)[1]
 
-    def _posture(self, state: State) -> jax.Array:
-        """Returns joint angles [3, 2] (rad) that bring the fingertip over each cube, or as near as the arm reaches.
+    def _posture(self, qpos: jax.Array, place: jax.Array) -> jax.Array:
+        """Returns joint angles [2] (rad) that bring the fingertip to a place [2] (m), or as near as the arm reaches.
 
-        Of the two solutions, elbow to the left and to the right, the nearer one to the present angles.
+        Of the two solutions, elbow to the left and to the right, it is the one that is nearer to the angles `qpos`.
         """
-        x, y = state.mocap_pos[:, :2].T
+        x, y = place
         upper, lower = jnp.linalg.norm(self._links, axis=-1)
         cosine = (x**2 + y**2 - upper**2 - lower**2) / (2 * upper * lower)
-        elbow = jnp.arccos(jnp.clip(cosine, -1, 1))[:, None] * jnp.array([1.0, -1.0])
-        ahead = jnp.arctan2(lower * jnp.sin(elbow), upper + lower * jnp.cos(elbow))
-        shoulder = (jnp.arctan2(y, x)[:, None] - ahead + jnp.pi) % (2 * jnp.pi) - jnp.pi
+        elbow = jnp.arccos(jnp.clip(cosine, -1, 1)) * jnp.array([1.0, -1.0])
+        shoulder = jnp.arctan2(y, x) - jnp.arctan2(lower * jnp.sin(elbow), upper + lower * jnp.cos(elbow))
+        shoulder = (shoulder + jnp.pi) % (2 * jnp.pi) - jnp.pi
         postures = jnp.stack([shoulder, elbow], axis=-1)
-        nearer = jnp.argmin(jnp.square(postures - state.qpos).sum(axis=-1), axis=-1)
-        return postures[jnp.arange(len(nearer)), nearer]
+        return postures[jnp.argmin(jnp.square(postures - qpos).sum(axis=-1))]
 
     def success(self, task: ReachTask, states: State) -> jax.Array:
         """Tells whether the fingertip touched the target in one of the last LAST_STEPS steps (paper, Appendix A)."""
