@@ -52,6 +52,21 @@ def test_a_cell_is_a_run(trained, tmp_path, monkeypatch):
         runner.run({"cell": config})
 
 
+def test_a_checkpoint_belongs_to_configuration_commit_and_versions_but_to_no_machine(tmp_path, monkeypatch):
+    config, origin = tiny_config(), {"commit": "a", "hardware": "one GPU", "versions": {"jax": "0.11"}}
+
+    def identity(**changes):
+        monkeypatch.setattr(cells.provenance, "origin", lambda: origin | changes)
+        return cells.Cells(tmp_path, 8)._identity(config)
+
+    first = identity()
+    assert identity(hardware="another GPU") == first
+    assert identity(commit="b") != first
+    assert identity(versions={"jax": "0.12"}) != first
+    config.optimizer.learning_rate = 0.5
+    assert identity() != first
+
+
 def test_bad_cells_are_refused_before_anything_is_planned(tmp_path):
     runner, config = cells.Cells(tmp_path, 8), tiny_config()
     config.data.tasks = 3
