@@ -77,7 +77,7 @@ def largest(x: jax.Array) -> jax.Array:
     return jax.lax.pmax(x, AXIS)
 
 
-def as_result(shapes: Any) -> Any:
+def replicated(shapes: Any) -> Any:
     """Places shapes (of `jax.eval_shape`) where `shard_tasks` leaves its results: complete on every device."""
     everywhere = NamedSharding(mesh(), PartitionSpec())
     return jax.tree.map(lambda x: x.update(sharding=everywhere), shapes)

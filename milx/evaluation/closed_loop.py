@@ -138,7 +138,7 @@ def precompile(env: Env, method: Method, params: Params, config: EvalConfig, tri
     adaptation = _adaptation(env, method)
     shown = params, batch.task, batch.states, batch.action
     adaptation.lower(*shown).compile()
-    task_params = parallel.as_result(jax.eval_shape(adaptation, *shown))
+    task_params = parallel.replicated(jax.eval_shape(adaptation, *shown))
     for count in trials:
         keys = jax.eval_shape(lambda count=count: jax.random.split(jax.random.key(0), (size, count)))
         scene = jax.eval_shape(lambda task, count=count: trial_scenes(env, task, jax.random.key(0), count), batch.task)
@@ -185,7 +185,7 @@ def precompile_listen(env: Env, method: Method, params: Params, config: EvalConf
     if (count := _listeners(config.validation_tasks)) >= 2:
         support, query = shapes(env, count, config.shots), shapes(env, count, 1)
         shown = params, support.task, support.states, support.action
-        adapted = parallel.as_result(jax.eval_shape(_adaptation(env, method), *shown))
+        adapted = parallel.replicated(jax.eval_shape(_adaptation(env, method), *shown))
         _compare.lower(env, method, params, adapted, query).compile()
 
 

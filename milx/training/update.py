@@ -200,7 +200,7 @@ class Trainer:
 
 
 def compile_in_background(
-    trainer: Trainer, params: Params, data: Any, steps: int, then: Iterable[Callable[[], None]] = ()
+    trainer: Trainer, params: Params, data: Any, steps: int, then: Iterable[Callable[[], None]]
 ) -> Future[Callable[..., Any]]:
     """Compiles `Trainer.run` from shapes alone while the caller does something else, then calls each of `then`.
 
