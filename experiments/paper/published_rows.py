@@ -130,7 +130,17 @@ _STEPS = {
         ),
         ("goal-head", "goal head", _GOAL_HEAD),
         ("calibrated", "votes from the camera's calibration", {"network.calibrate": True}),
-        ("fast", "36,000 updates, none without an inner step: `fast`", {"train.steps": 36_000} | _NO_IMITATION),
+        (
+            "fast",
+            "more of the beginning, 12,000 updates, none without an inner step: `fast`",
+            {
+                "data.plan_iterations": 4,
+                "train.frame_exponent": 2.0,
+                "train.steps": 12_000,
+                "train.eval_every": 4000,
+            }
+            | _NO_IMITATION,
+        ),
     ),
     "push": (
         ("one-head", "one head", {"network.heads": 1}),
