@@ -1,10 +1,14 @@
 """One tiny run, planned, trained and evaluated once; tests of its parts look at what it left."""
 
+import contextlib
 import dataclasses
 import gc
 import json
+import logging
 import os
 import pathlib
+import re
+from collections.abc import Iterator
 from typing import Any
 
 import filelock
@@ -18,13 +22,19 @@ from milx.data.simulated import DemoSet
 from milx.training.simulated import SimulatedRun
 
 milx.configure()
-# Compiling takes longer than running here. Programs of one operation are not worth a file in the cache.
+# Compiling takes longer than running here.
 _FLAGS = ("backend_optimization_level=0", "llvm_disable_expensive_passes=true", "cpu_parallel_codegen_split_count=1")
 os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *(f"--xla_{flag}" for flag in _FLAGS)])
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.05)
 # Tracing makes very many objects: a collection after every 700 of them would find little to free.
 gc.freeze()
 gc.set_threshold(50_000)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Puts one file that needs the tiny run first and the others last, so that no process waits for the other's run."""
+    needing = sorted({item.path for item in items if "trained" in getattr(item, "fixturenames", ())})
+    rank = {path: 1 for path in needing} | {path: -1 for path in needing[:1]}
+    items.sort(key=lambda item: rank.get(item.path, 0))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,6 +46,8 @@ class Trained:
     train: DemoSet
     validation: DemoSet
     test: DemoSet
+    compiled: list[str]
+    """The names of the functions that it compiled, one after the other."""
 
     @property
     def folder(self) -> pathlib.Path:
@@ -76,7 +88,30 @@ def trained(cache, shared) -> Trained:
         run = SimulatedRun(tiny_config(), shared / "run", QUIET)
         if not (run.folder / "evaluation.json").is_file():
             run._large = run.env  # a video of large images takes longer to draw than to compile
-            run.train()
-            run.evaluate()
+            with _noting_compilations() as compiled:
+                run.train()
+                run.evaluate()
+            (shared / "compiled.json").write_text(json.dumps(compiled))
     result = json.loads((run.folder / "evaluation.json").read_text())
-    return Trained(run, result, *(run.demos(split) for split in ("train", "validation", "test")))
+    compiled = json.loads((shared / "compiled.json").read_text())
+    return Trained(run, result, *(run.demos(split) for split in ("train", "validation", "test")), compiled)
+
+
+@contextlib.contextmanager
+def _noting_compilations() -> Iterator[list[str]]:
+    """Yields a list to which the names of the functions are added that JAX compiles."""
+    names = []
+
+    class Handler(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            if found := re.match(r"Finished XLA compilation of jit\((.*?)\)", record.getMessage()):
+                names.append(found[1])
+
+    logger, handler = logging.getLogger("jax"), Handler()
+    logger.addHandler(handler)
+    jax.config.update("jax_log_compiles", True)  # in all threads, where jax.log_compiles() is for one
+    try:
+        yield names
+    finally:
+        jax.config.update("jax_log_compiles", False)
+        logger.removeHandler(handler)

@@ -1,5 +1,6 @@
 """Mapping a function over more inputs than fit on a device at once: by several calls, or inside `jax.jit`."""
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -15,6 +16,8 @@ def map_in_chunks(function: Callable[..., Any], inputs: tuple, size: int, counte
     All calls have the same size, so the function is compiled only once. The last slice is filled up by repeating the
     last entry.
 
+    The inputs of every call are complete on every device (`milx.core.parallel.replicate`).
+
     Args:
         function: maps pytrees with leading axis [size] to a pytree with leading axis [size].
         inputs: pytrees with leading axis [M].
@@ -28,11 +31,21 @@ def map_in_chunks(function: Callable[..., Any], inputs: tuple, size: int, counte
     results = []
     for start in range(0, total, size):
         index = jnp.minimum(jnp.arange(start, start + size), total - 1)
-        result = jax.block_until_ready(function(*jax.tree.map(lambda x, index=index: x[index], inputs)))
+        results.append(jax.block_until_ready(function(*_take(inputs, index))))
         if counted:
             progress.advance(size)
-        results.append(jax.tree.map(lambda x, start=start: x[: total - start], result))
-    return jax.tree.map(lambda *xs: jnp.concatenate(xs), *results)
+    return _join(results, total)
+
+
+# One program each, instead of one for every shape and operation.
+@jax.jit
+def _take(inputs: tuple, index: jax.Array) -> tuple:
+    return parallel.replicate(jax.tree.map(lambda x: x[index], inputs))
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def _join(results: list[Any], total: int) -> Any:
+    return jax.tree.map(lambda *xs: jnp.concatenate(xs)[:total], *results)
 
 
 def map_in_groups(function: Callable[..., Any], inputs: tuple, most: int) -> Any:

@@ -77,10 +77,23 @@ def largest(x: jax.Array) -> jax.Array:
     return jax.lax.pmax(x, AXIS)
 
 
+@jax.jit
+def replicate(tree: Any) -> Any:
+    """Places arrays complete on every device, as the results of `shard_tasks` are, inside `jax.jit` or not.
+
+    A program is compiled once more for arguments that are placed elsewhere, even if there is only one device.
+    """
+    return jax.lax.with_sharding_constraint(tree, NamedSharding(mesh(), PartitionSpec()))
+
+
 def replicated(shapes: Any) -> Any:
-    """Places shapes (of `jax.eval_shape`) where `shard_tasks` leaves its results: complete on every device."""
+    """Returns the shapes (of arrays or of `jax.eval_shape`) of what `replicate` has placed."""
     everywhere = NamedSharding(mesh(), PartitionSpec())
-    return jax.tree.map(lambda x: x.update(sharding=everywhere), shapes)
+
+    def place(x: Any) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=everywhere, weak_type=x.weak_type)
+
+    return jax.tree.map(place, shapes)
 
 
 def shard_tasks(function: Callable[..., Any], *, shared: int = 0, average: bool = False) -> Callable[..., Any]:

@@ -52,7 +52,7 @@ def configure() -> None:
             warnings.warn(late, RuntimeWarning, stacklevel=2)
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "jax"))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
 def warn_if_not_configured() -> None:

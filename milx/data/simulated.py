@@ -88,27 +88,31 @@ def collect(
 
     states, action = map_in_chunks(plan_part, (each, state, keys, tactic), config.plan_batch)
     success, _ = map_in_chunks(functools.partial(judge, env), (each, states), config.plan_batch)
-    states, action, success = _without_diverged(states, action, success)
-    states, action, success = jax.tree.map(
-        lambda x: x.reshape(num_tasks, num_demos, *x.shape[1:]), (states, action, success)
-    )
-    order = jnp.argsort(~success, axis=1)
-    rows = jnp.arange(num_tasks)[:, None]
-    return DemoSet(tasks, *jax.tree.map(lambda x: x[rows, order], (states, action, success)))
+    demos, diverged = _arrange(tasks, states, action, success)
+    if diverged:
+        print(f"milx: {diverged} of {len(action)} demonstrations diverged and are dropped", file=sys.stderr)
+    return demos
 
 
 def _of_one_task(demos: DemoSet) -> tuple[State, jax.Array]:
     return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), (demos.states, demos.action))
 
 
-def _without_diverged(states: State, action: jax.Array, success: jax.Array) -> tuple[State, jax.Array, jax.Array]:
-    """Zeros what is not finite of M demonstrations, so that they count as failed; says how many there are."""
+@jax.jit
+def _arrange(tasks: Task, states: State, action: jax.Array, success: jax.Array) -> tuple[DemoSet, jax.Array]:
+    """Sorts N D demonstrations by task, those that succeed first, and counts those that are not finite.
+
+    What is not finite becomes zero, so that they count as failed.
+    """
     flat = [x.reshape(len(x), -1) for x in jax.tree.leaves((states, action)) if x.size]
     finite = jnp.stack([jnp.isfinite(x).all(axis=1) for x in flat]).all(axis=0)
-    if diverged := int((~finite).sum()):
-        print(f"milx: {diverged} of {len(finite)} demonstrations diverged and are dropped", file=sys.stderr)
     keep = lambda x: jnp.where(finite.reshape(-1, *[1] * (x.ndim - 1)), x, jnp.zeros((), x.dtype))  # noqa: E731
-    return *jax.tree.map(keep, (states, action)), success & finite
+    kept = *jax.tree.map(keep, (states, action)), success & finite
+    num_tasks = len(jax.tree.leaves(tasks)[0])
+    of_task = jax.tree.map(lambda x: x.reshape(num_tasks, -1, *x.shape[1:]), kept)
+    order = jnp.argsort(~of_task[-1], axis=1)
+    rows = jnp.arange(num_tasks)[:, None]
+    return DemoSet(tasks, *jax.tree.map(lambda x: x[rows, order], of_task)), (~finite).sum()
 
 
 @functools.partial(jax.jit, static_argnums=(0, 2, 3, 4))

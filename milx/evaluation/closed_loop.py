@@ -114,18 +114,27 @@ def run_trials(
     Returns:
         The success of every trial, and the states that it visited.
     """
-    scene_key, act_key = jax.random.split(key)
-    scene = trial_scenes(env, demos.task, scene_key, config.trials)
-    shown = jax.tree.map(lambda x: jnp.roll(x, -1, axis=0), demos) if misled else demos
-    support = jax.tree.map(lambda x: x[:, : config.shots], (shown.states, shown.action))
-    keys = jax.random.split(act_key, (demos.num_tasks, config.trials))
-    scene, keys = jax.tree.map(lambda x: x[:, :first], (scene, keys))
+    params = parallel.replicate(params)
+    inputs = _trial_inputs(env, demos, key, config.shots, config.trials, misled, first)
 
     def run(task: Task, shown: Task, states: State, action: jax.Array, scene: State, keys: jax.Array) -> Trials:
         task_params = _adaptation(env, method)(params, shown, states, action)
         return _acting(env, method)(task_params, task, scene, keys)
 
-    return map_in_chunks(run, (demos.task, shown.task, *support, scene, keys), config.batch)
+    return map_in_chunks(run, inputs, config.batch)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 3, 4, 5, 6))
+def _trial_inputs(
+    env: Env, demos: DemoSet, key: jax.Array, shots: int, trials: int, misled: bool, first: int | None
+) -> tuple[Task, Task, State, jax.Array, State, jax.Array]:
+    """Returns each task, and what its policy is shown (task, states and actions) and starts from (scenes and keys)."""
+    scene_key, act_key = jax.random.split(key)
+    scene = trial_scenes(env, demos.task, scene_key, trials)
+    keys = jax.random.split(act_key, (demos.num_tasks, trials))
+    shown = jax.tree.map(lambda x: jnp.roll(x, -1, axis=0), demos) if misled else demos
+    states, action = jax.tree.map(lambda x: x[:, :shots], (shown.states, shown.action))
+    return demos.task, shown.task, states, action, *jax.tree.map(lambda x: x[:, :first], (scene, keys))
 
 
 def precompile(env: Env, method: Method, params: Params, config: EvalConfig, trials: Sequence[int]) -> None:
@@ -134,15 +143,15 @@ def precompile(env: Env, method: Method, params: Params, config: EvalConfig, tri
     `params` may be shapes.
     """
     size = parallel.round_up(config.batch)
-    batch = shapes(env, size, config.shots)
+    params, batch = parallel.replicated((params, shapes(env, size, config.shots)))
     adaptation = _adaptation(env, method)
     shown = params, batch.task, batch.states, batch.action
     adaptation.lower(*shown).compile()
     task_params = parallel.replicated(jax.eval_shape(adaptation, *shown))
     for count in trials:
-        keys = jax.eval_shape(lambda count=count: jax.random.split(jax.random.key(0), (size, count)))
-        scene = jax.eval_shape(lambda task, count=count: trial_scenes(env, task, jax.random.key(0), count), batch.task)
-        _acting(env, method).lower(task_params, batch.task, scene, keys).compile()
+        inputs = _trial_inputs.eval_shape(env, batch, jax.random.key(0), config.shots, count, False, None)
+        starts = parallel.replicated(inputs[-2:])
+        _acting(env, method).lower(task_params, batch.task, *starts).compile()
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
@@ -164,15 +173,22 @@ def listen(env: Env, method: Method, params: Params, demos: DemoSet, config: Eva
     count = _listeners(demos.num_tasks)
     if count < 2:
         return {}
-    chosen = jax.tree.map(lambda x: x[:count], demos)
-    support, query = (
-        jax.tree.map(lambda x, part=part: x[:, part], (chosen.states, chosen.action, chosen.success))
-        for part in (slice(config.shots), slice(config.shots, config.shots + 1))
-    )
+    params = parallel.replicate(params)
+    support, query = _support_and_query(demos, count, config.shots)
     adapt = functools.partial(_adaptation(env, method), params)
-    adapted = map_in_chunks(adapt, (chosen.task, *support[:2]), config.batch, counted=False)
-    found = _compare(env, method, params, adapted, DemoSet(chosen.task, *query))
+    adapted = map_in_chunks(adapt, (support.task, support.states, support.action), config.batch, counted=False)
+    found = _compare(env, method, params, adapted, query)
     return {name: float(value) for name, value in found.items()}
+
+
+@functools.partial(jax.jit, static_argnums=(1, 2))
+def _support_and_query(demos: DemoSet, count: int, shots: int) -> tuple[DemoSet, DemoSet]:
+    """Returns the first demonstrations of the first `count` tasks, and the next one of each."""
+    task = jax.tree.map(lambda x: x[:count], demos.task)
+    rest = demos.states, demos.action, demos.success
+    parts = slice(shots), slice(shots, shots + 1)
+    support, query = (DemoSet(task, *jax.tree.map(lambda x, part=part: x[:count, part], rest)) for part in parts)
+    return parallel.replicate((support, query))
 
 
 def _listeners(num_tasks: int) -> int:
@@ -183,7 +199,7 @@ def _listeners(num_tasks: int) -> int:
 def precompile_listen(env: Env, method: Method, params: Params, config: EvalConfig) -> None:
     """Compiles what `listen` runs after an adaptation, into the compilation cache; `params` may be shapes."""
     if (count := _listeners(config.validation_tasks)) >= 2:
-        support, query = shapes(env, count, config.shots), shapes(env, count, 1)
+        params, support, query = parallel.replicated((params, shapes(env, count, config.shots), shapes(env, count, 1)))
         shown = params, support.task, support.states, support.action
         adapted = parallel.replicated(jax.eval_shape(_adaptation(env, method), *shown))
         _compare.lower(env, method, params, adapted, query).compile()
@@ -210,17 +226,8 @@ def evaluate_baselines(env: Env, demos: DemoSet, config: EvalConfig, expert: Dat
     candidate; the expert does without noise what it planned or rehearsed.
     """
     num_trials = min(config.baseline_trials, config.trials)
-    scene = trial_scenes(env, demos.task, jax.random.split(key)[0], config.trials)
     total = demos.num_tasks * num_trials  # said, as arrays without entries do not tell
-    scene = jax.tree.map(lambda x: x[:, :num_trials].reshape(total, *x.shape[2:]), scene)
-    task = jax.tree.map(lambda x: jnp.repeat(x, num_trials, axis=0), demos.task)
-    keys = jax.random.split(jax.random.fold_in(key, 1), total)
-
-    # Both experts plan for the task as they believe it to be, and both are judged by the task as it is.
-    believed = jax.vmap(env.task_blind)(keys, task), task
-    tasks, scenes, keys = (
-        jax.tree.map(lambda *xs: jnp.concatenate(xs), *pair) for pair in (believed, (scene, scene), (keys, keys))
-    )
+    tasks, scenes, keys, as_it_is = _expert_inputs(env, demos.task, key, config.trials, num_trials)
     options = Options(iterations=expert.plan_iterations)
     tactic = None if options.iterations else choose_tactics(env, tasks, scenes, expert.plan_batch)
 
@@ -228,7 +235,6 @@ def evaluate_baselines(env: Env, demos: DemoSet, config: EvalConfig, expert: Dat
         return perform(env, task, state, key, options, 0.0, tactic)
 
     states, _ = map_in_chunks(plan, (tasks, scenes, keys, tactic), expert.plan_batch)
-    as_it_is = jax.tree.map(lambda x: jnp.concatenate([x, x]), task)
     success, other = map_in_chunks(functools.partial(judge, env), (as_it_is, states), expert.plan_batch)
     random = run_trials(env, Random(env.action_size), {}, demos, config, key, first=num_trials)
 
@@ -241,6 +247,25 @@ def evaluate_baselines(env: Env, demos: DemoSet, config: EvalConfig, expert: Dat
         }
 
     return Baselines(rates(success, random.success), {name: rates(other[name], random.other[name]) for name in other})
+
+
+@functools.partial(jax.jit, static_argnums=(0, 3, 4))
+def _expert_inputs(
+    env: Env, task: Task, key: jax.Array, trials: int, first: int
+) -> tuple[Task, State, jax.Array, Task]:
+    """Returns the first trials of N tasks, first for the task-blind expert and then for the expert, 2 N `first` in all.
+
+    Both plan for the task as they believe it to be, and both are judged by the task as it is, which comes last.
+    """
+    total = len(jax.tree.leaves(task)[0]) * first
+    scene = trial_scenes(env, task, jax.random.split(key)[0], trials)
+    scene = jax.tree.map(lambda x: x[:, :first].reshape(total, *x.shape[2:]), scene)
+    task = jax.tree.map(lambda x: jnp.repeat(x, first, axis=0), task)
+    keys = jax.random.split(jax.random.fold_in(key, 1), total)
+    believed = jax.vmap(env.task_blind)(keys, task)
+    pairs = (believed, task), (scene, scene), (keys, keys), (task, task)
+    tasks, scenes, keys, as_it_is = (jax.tree.map(lambda *xs: jnp.concatenate(xs), *pair) for pair in pairs)
+    return tasks, scenes, keys, as_it_is
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -256,7 +281,7 @@ def precompile_film(camera: Env, num_tasks: int) -> None:
     """Compiles what `film` runs for so many tasks, into the compilation cache."""
     demos = shapes(camera, num_tasks, 1)
     states = jax.tree.map(lambda x: jax.ShapeDtypeStruct((num_tasks, *x.shape[2:]), x.dtype), demos.states)
-    film.lower(camera, demos.task, states).compile()
+    film.lower(camera, *parallel.replicated((demos.task, states))).compile()
 
 
 def summarize(

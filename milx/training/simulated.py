@@ -17,10 +17,10 @@ from rich.console import Console
 from milx import envs
 from milx.config.check import check_config
 from milx.config.schema import Config, EvalConfig
-from milx.core import platform, pytrees
+from milx.core import parallel, platform, pytrees
 from milx.data import simulated as demos_lib
 from milx.data.simulated import DemoSet
-from milx.envs.base import State
+from milx.envs.base import State, Task
 from milx.evaluation import closed_loop, plots
 from milx.evaluation.closed_loop import Trials
 from milx.methods import Method, whitening
@@ -127,6 +127,13 @@ def result_of(
     run = functools.partial(closed_loop.run_trials, env, method, params, demos, config.evaluation, trial_key("test"))
     trials, misled = run(), run(misled=True, first=config.evaluation.baseline_trials)
     return trials, closed_loop.summarize(env, config, demos.task, trials, misled, baselines)
+
+
+@jax.jit
+def _firsts(test: DemoSet, trials: Trials) -> tuple[Task, State, State]:
+    """Returns the tasks that a video shows, the first demonstration of each and the first trial."""
+    task, demo, trial = jax.tree.map(lambda x: x[:_FILMED], (test.task, test.states, trials.states))
+    return parallel.replicate((task, *(jax.tree.map(lambda x: x[:, 0], states) for states in (demo, trial))))
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -244,7 +251,6 @@ class SimulatedRun(Run):
 
     def _film(self, test: DemoSet, trials: Trials) -> None:
         """Writes the video: demonstrations beside the first trial of the same held-out tasks, in large."""
-        task, demo, trial = jax.tree.map(lambda x: x[:_FILMED], (test.task, test.states, trials.states))
-        firsts = [jax.tree.map(lambda x: x[:, 0], states) for states in (demo, trial)]
-        left, right = (np.asarray(closed_loop.film(self._large, task, states)) for states in firsts)
+        task, demo, trial = _firsts(test, trials)
+        left, right = (np.asarray(closed_loop.film(self._large, task, states)) for states in (demo, trial))
         plots.side_by_side(left, right, self.folder / VIDEO)

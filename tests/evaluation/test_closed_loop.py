@@ -12,6 +12,7 @@ import scipy.stats
 from tiny import tiny_config
 
 from milx.config.schema import EvalConfig
+from milx.core import parallel
 from milx.core.batching import map_in_chunks, map_in_groups
 from milx.envs.reach.env import Reach
 from milx.evaluation import closed_loop, intervals
@@ -185,7 +186,7 @@ def test_listening_and_filming_find_their_programs_compiled(trained, caplog):
     method, env, config = dataclasses.replace(trained.run.method), Reach((8, 10)), trained.config.evaluation
     whitening = Whitening(*(jnp.full(n, v) for n in (8, 2) for v in (0.0, 1.0)))
     params = method.init(jax.random.key(0), whitening)
-    first = jax.tree.map(lambda x: jnp.asarray(x[:, 0]), trained.validation.states)
+    first = jax.tree.map(lambda x: x[:, 0], trained.validation.states)
     names = ("adapt_tasks", "_compare", "film")
     with jax.log_compiles():
         closed_loop.precompile(trained.run.env, method, params, config, ())
@@ -193,8 +194,14 @@ def test_listening_and_filming_find_their_programs_compiled(trained, caplog):
         closed_loop.precompile_film(env, 3)
         assert compiled(caplog, *names) == [True, True, True]
         closed_loop.listen(trained.run.env, method, params, trained.validation, config)
-        closed_loop.film(env, trained.validation.task, first)
+        closed_loop.film(env, *parallel.replicate((trained.validation.task, first)))
         assert compiled(caplog, *names) == [False, False, False]
+
+
+def test_a_run_compiles_every_large_program_once(trained):
+    """Trials are of the policy or of random actions; baselines and another task's demonstration need fewer."""
+    once = {"run": 1, "_perform_planned": 1, "_compare": 1, "film": 1, "adapt_tasks": 2, "run_tasks": 3}
+    assert {name: trained.compiled.count(name) for name in once} == once
 
 
 def test_validation_and_test_trials_differ(trained):

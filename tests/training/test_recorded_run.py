@@ -62,15 +62,15 @@ def tiny_config(folder):
 
 
 @pytest.fixture(scope="module")
-def trained(cache, folder, tmp_path_factory):
+def finished(cache, folder, tmp_path_factory):
     run = make_run(tiny_config(folder), tmp_path_factory.mktemp("run"), QUIET)
     run.train()
     return run, run.evaluate()
 
 
-def test_held_out_tasks_are_learned_from_their_demonstration(trained):
+def test_held_out_tasks_are_learned_from_their_demonstration(finished):
     """Compares with the direction's share of the actions' variance, 1.5^2/2 of 1.5^2/2 + 0.5^2: it is the task."""
-    run, result = trained
+    run, result = finished
     errors = result["action_error"]
     assert errors["tasks"] == 6
     assert errors["mean_action"] == pytest.approx(1, abs=0.25)
@@ -89,9 +89,9 @@ def read_resampled(data, task):
     return [data.read(task, i, index) for i, index in enumerate(steps)]
 
 
-def test_errors_are_those_of_a_loop_over_demonstrations(trained, folder):
+def test_errors_are_those_of_a_loop_over_demonstrations(finished, folder):
     """Compares what the run reports with what the policy that users load does, step by step."""
-    run, result = trained
+    run, result = finished
     policy, data = milx.load(run.folder), DataSet(folder)
     training = recorded.read_vectors(data, data.header.of_split("train"), HORIZON).action
     errors = []
@@ -105,8 +105,8 @@ def test_errors_are_those_of_a_loop_over_demonstrations(trained, folder):
     assert np.mean(errors) == pytest.approx(result["action_error"]["after"], rel=1e-4)
 
 
-def test_whitening_is_fitted_to_the_training_tasks_alone(trained, folder):
-    run, _ = trained
+def test_whitening_is_fitted_to_the_training_tasks_alone(finished, folder):
+    run, _ = finished
     data = DataSet(folder)
     rows = [demo for task in data.header.of_split("train") for demo in read_resampled(data, task)]
     whitening = milx.load(run.folder).params["whitening"]
@@ -117,7 +117,9 @@ def test_whitening_is_fitted_to_the_training_tasks_alone(trained, folder):
 
 
 @pytest.mark.slow
-def test_an_interrupted_run_ends_bit_for_bit_like_the_uninterrupted_one(trained, folder, tmp_path, monkeypatch, capsys):
+def test_an_interrupted_run_ends_bit_for_bit_like_the_uninterrupted_one(
+    finished, folder, tmp_path, monkeypatch, capsys
+):
     """Interrupts a run, also one whose data passes by in shards, of which none is whole."""
     config = tiny_config(folder)
     config.train.steps, config.train.eval_every = 200, 100
@@ -282,8 +284,8 @@ def test_data_that_are_not_finite_are_refused_by_name(tmp_path):
         run._load()
 
 
-def test_the_report_names_the_floors(trained):
-    run, result = trained
+def test_the_report_names_the_floors(finished):
+    run, result = finished
     run.console = Console(record=True, width=200, file=io.StringIO())
     run.report(result)
     text = run.console.export_text()
