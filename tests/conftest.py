@@ -18,10 +18,13 @@ from tiny import QUIET, tiny_config
 
 import milx
 from milx.config.schema import Config
+from milx.core import platform
 from milx.data.simulated import DemoSet
 from milx.training.simulated import SimulatedRun
 
 milx.configure()
+# The options for drawing many pixels make programs compile twice as long, and tests draw few.
+platform.pixel_options = dict
 # Compiling takes longer than running here.
 _FLAGS = ("backend_optimization_level=0", "llvm_disable_expensive_passes=true", "cpu_parallel_codegen_split_count=1")
 os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *(f"--xla_{flag}" for flag in _FLAGS)])

@@ -256,6 +256,7 @@ CELLS = st.one_of(
 )
 
 
+@pytest.mark.slow
 @cases("parquet")
 @given(data=st.data())
 def test_tables_of_lerobot(data, tmp_path_factory):

@@ -28,7 +28,14 @@ def registries():
         each.update(entries)
 
 
-@pytest.mark.parametrize("path", [path for path in PAGES if blocks(path, "python")], ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path",
+    [
+        pytest.param(path, marks=[pytest.mark.slow] if path.stem == "your_own_demonstrations" else [], id=path.stem)
+        for path in PAGES
+        if blocks(path, "python")
+    ],
+)
 def test_the_blocks_of_a_how_to_run(path, tmp_path, monkeypatch, cache, registries):
     monkeypatch.chdir(tmp_path)
     scope = {"__name__": "__main__"}

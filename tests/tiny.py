@@ -12,7 +12,7 @@ def tiny_config(seed: int = 0, env: str = "reach") -> Config:
     """Returns sizes at which compiling takes far longer than running."""
     config = make_config(env, preset="cpu", seed=seed)
     config.data.tasks, config.data.demos_per_task = 8, 3
-    config.data.plan_iterations, config.data.plan_batch = 8, 10  # the quickstart's, which finds the program compiled
+    config.data.plan_iterations, config.data.plan_batch = 3, 10
     config.network.fc_layers = (16,)
     if env == "reach":
         config.network.filters, config.network.strides = (4, 4), (2, 2)

@@ -6,11 +6,14 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from milx.core import parallel, progress
 
 
-def map_in_chunks(function: Callable[..., Any], inputs: tuple, size: int, counted: bool = True) -> Any:
+def map_in_chunks(
+    function: Callable[..., Any], inputs: tuple, size: int, counted: bool = True, rows: np.ndarray | None = None
+) -> Any:
     """Calls `function(*inputs)` on slices of the leading axis and joins the results.
 
     All calls have the same size, so the function is compiled only once. The last slice is filled up by repeating the
@@ -23,14 +26,16 @@ def map_in_chunks(function: Callable[..., Any], inputs: tuple, size: int, counte
         inputs: pytrees with leading axis [M].
         size: number of entries in one call. It is rounded up to a multiple of the number of devices.
         counted: whether the entries count as done in `milx.core.progress` after each call.
+        rows: [R] which entries to map, in this order; None for all.
 
     Returns:
-        The results, with leading axis [M].
+        The results, with leading axis [M] or [R].
     """
-    total, size = len(jax.tree.leaves(inputs)[0]), parallel.round_up(size)
+    rows = np.arange(len(jax.tree.leaves(inputs)[0])) if rows is None else rows
+    total, size = len(rows), parallel.round_up(size)
     results = []
     for start in range(0, total, size):
-        index = jnp.minimum(jnp.arange(start, start + size), total - 1)
+        index = rows[np.minimum(np.arange(start, start + size), total - 1)]
         results.append(jax.block_until_ready(function(*_take(inputs, index))))
         if counted:
             progress.advance(size)
@@ -39,7 +44,7 @@ def map_in_chunks(function: Callable[..., Any], inputs: tuple, size: int, counte
 
 # One program each, instead of one for every shape and operation.
 @jax.jit
-def _take(inputs: tuple, index: jax.Array) -> tuple:
+def _take(inputs: tuple, index: np.ndarray) -> tuple:
     return parallel.replicate(jax.tree.map(lambda x: x[index], inputs))
 
 

@@ -125,8 +125,8 @@ def choose_tactics(env: Env, task: Task, state: State, batch: int) -> np.ndarray
 
     for tactic in env.tactics:
         if len(unsolved):
-            scenes = jax.tree.map(lambda x, index=unsolved: x[index], (task, state))
-            success = np.asarray(map_in_chunks(functools.partial(rehearse, tactic), scenes, batch, counted=False))
+            try_tactic = functools.partial(rehearse, tactic)
+            success = np.asarray(map_in_chunks(try_tactic, (task, state), batch, counted=False, rows=unsolved))
             chosen[unsolved[success]] = tactic
             unsolved = unsolved[~success]
     return chosen

@@ -240,7 +240,7 @@ def test_only_what_lies_still_within_the_targets_rim_counts(env, task):
 
 def test_scenes_keep_their_distances_and_redrawing_keeps_the_targets_place(env, task):
     keys = jax.random.split(jax.random.key(5), 300)
-    scenes = jax.vmap(env.reset, in_axes=(0, None))(keys, task)
+    scenes = jax.jit(jax.vmap(env.reset, in_axes=(0, None)))(keys, task)
 
     def gap(places):
         return np.linalg.norm(places[:, [0, 0, 1], :2] - places[:, [1, 2, 2], :2], axis=-1).min(axis=1)

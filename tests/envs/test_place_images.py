@@ -33,7 +33,7 @@ def test_the_image_is_that_of_the_tasks_own_model(env, task):
     for name in ("geom_pos", "geom_quat", "geom_size"):
         getattr(model, name)[:] = getattr(ours, name)
     model.geom_sameframe[:] = 0
-    model.geom_rgba[:] = env.colors(task)
+    model.geom_rgba[:] = jax.jit(env.colors)(task)
     data = mujoco.MjData(model)
     data.qpos[:], data.mocap_pos[:] = state.qpos, state.mocap_pos
     mujoco.mj_forward(model, data)

@@ -120,7 +120,7 @@ def test_what_is_planned_is_what_its_version_says(env, shown):
 def scenes_of(env, tasks):
     """Resets each task to a scene, and makes a key for its noise."""
     keys = jax.random.split(jax.random.key(9), len(tasks.target))
-    return jax.vmap(env.reset)(keys, tasks), keys
+    return jax.jit(jax.vmap(env.reset))(keys, tasks), keys
 
 
 def test_the_controller_pushes_most_objects_to_the_goal_in_spite_of_noise(env, shown):
@@ -189,7 +189,7 @@ def test_the_image_is_that_of_the_tasks_own_model(env, task):
     """Compares geoms, sizes and colors of objects without a texture; what is not used is not seen."""
     task = dataclasses.replace(task, texture=task.texture._replace(family=jnp.zeros(2, jnp.int32)))
     model = c_model(env, task)
-    model.geom_rgba[:] = env.colors(task)
+    model.geom_rgba[:] = jax.jit(env.colors)(task)
     state = env.reset(jax.random.key(5), task)
     data = mujoco.MjData(model)
     data.qpos[:] = state.qpos

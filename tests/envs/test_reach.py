@@ -222,7 +222,7 @@ def test_the_image_shows_cubes_and_fingertip_where_they_are():
         tasks = jax.vmap(lambda key: env.sample_task(key, "test"))(keys)
         primaries = np.stack([rng.permutation(np.eye(3)) for _ in range(n)])
         tasks = dataclasses.replace(tasks, object_color=jnp.asarray(primaries, jnp.float32))
-        states = jax.vmap(env.reset)(keys, tasks)
+        states = jax.jit(jax.vmap(env.reset))(keys, tasks)
         states = dataclasses.replace(states, qpos=jnp.asarray(rng.uniform(-3, 3, (n, 2)), jnp.float32))
         observation = jax.jit(jax.vmap(env.observe))(tasks, states)
     assert observation.image.dtype == np.uint8
@@ -266,7 +266,7 @@ def test_unknown_names_are_told_the_known_ones(env):
 
 def test_postures_bring_the_fingertip_over_the_cubes(env, task):
     """The arm reaches from 0.21 - 0.2 to 0.21 m; a cube nearer or farther is as near as the arm can come to it."""
-    states = jax.vmap(env.reset, in_axes=(0, None))(jax.random.split(jax.random.key(5), 500), task)
+    states = jax.jit(jax.vmap(env.reset, in_axes=(0, None)))(jax.random.split(jax.random.key(5), 500), task)
     cubes = np.asarray(states.mocap_pos[..., :2])
     postures = jax.vmap(jax.vmap(env._posture, in_axes=(None, 0)))(states.qpos, cubes)
     tip = np.asarray(jax.vmap(jax.vmap(env.fingertip))(postures))
@@ -278,7 +278,7 @@ def test_postures_bring_the_fingertip_over_the_cubes(env, task):
 def test_the_guess_ends_at_the_target_under_c_mujoco(env):
     """Within 1 cm, in every scene whose target is within reach."""
     tasks = jax.vmap(lambda key: env.sample_task(key, "train"))(jax.random.split(jax.random.key(6), 40))
-    starts = jax.vmap(env.reset)(jax.random.split(jax.random.key(7), 40), tasks)
+    starts = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(7), 40), tasks)
     guesses = np.asarray(jax.jit(jax.vmap(env.guess))(tasks, starts))
     model, tried = env.mj_model, 0
     data, tip = mujoco.MjData(model), model.site("fingertip").id

@@ -226,6 +226,10 @@ def test_map_in_chunks_is_a_plain_call(total, size):
     assert shapes == [(size,)] * -(-total // size), "every call has the same size"
     jax.tree.map(np.testing.assert_array_equal, found, function(*inputs))
 
+    rows = np.arange(total)[::-2]
+    found = map_in_chunks(function, inputs, size, rows=rows)
+    jax.tree.map(np.testing.assert_array_equal, found, function(*jax.tree.map(lambda x: x[rows], inputs)))
+
 
 @pytest.mark.parametrize(("total", "most", "groups"), [(6, 4, 2), (6, 6, 1), (6, 9, 1), (7, 4, 7), (4, 0, 4)])
 def test_map_in_groups_is_vmap_in_the_fewest_equal_groups(total, most, groups):

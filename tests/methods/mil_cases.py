@@ -41,7 +41,7 @@ def random_params(**network):
     """Makes a tiny network and parameters that are nowhere zero."""
     policy = make_policy(PolicyConfig(**TINY | network), IMAGE_SHAPE, STATE, ACTION, len(GOAL_INDICES))
     rng = np.random.default_rng(1)
-    draw = lambda leaf: jnp.asarray(leaf + 0.2 * rng.standard_normal(leaf.shape))  # noqa: E731
+    draw = lambda leaf: jnp.asarray(np.asarray(leaf) + 0.2 * rng.standard_normal(leaf.shape))  # noqa: E731
     return policy, jax.tree.map(draw, jax.jit(policy.init)(jax.random.key(0)))
 
 
@@ -62,7 +62,7 @@ def assert_trees_close(found, expected):
 
 
 def difference(after, before):
-    return jax.tree.map(lambda a, b: a - b, after, before)
+    return jax.tree.map(lambda a, b: np.asarray(a) - np.asarray(b), after, before)
 
 
 def random_batch():

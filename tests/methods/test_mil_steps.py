@@ -119,7 +119,7 @@ def test_votes_start_from_the_cameras_calibration_in_whitened_units():
     whitening, corner = random_whitening(np.random.default_rng(4)), np.array([0.3, -0.6, 1.0])
     image_to_goal = ((0.4, 0.0), (0.1, -0.2), (0.3, 0.5))
     method = MIL(MILConfig(), network, GOAL_INDICES, image_to_goal)
-    policy = method.init(jax.random.key(0), whitening)["policy"]
+    policy = jax.jit(method.init)(jax.random.key(0), whitening)["policy"]
     state = np.zeros(STATE)
     state[list(GOAL_INDICES)] = corner @ np.array(image_to_goal)
     for part in ("controller", "hindsight"):
@@ -164,7 +164,7 @@ def test_a_small_step_lowers_the_inner_loss_by_its_gradients_square(batch):
         return method.imitation_loss(theta, params["whitening"], support, inner=True)[0]
 
     change = inner_loss(jax.jit(method.adapt)(params, support)["policy"]) - inner_loss(params["policy"])
-    square = optax.tree.norm(jax.jit(jax.grad(inner_loss))(params["policy"])) ** 2
+    square = jax.jit(lambda theta: optax.tree.norm(jax.grad(inner_loss)(theta)))(params["policy"]) ** 2
     np.testing.assert_allclose(change, -1e-6 * square, rtol=1e-3)
 
 
@@ -174,7 +174,7 @@ def test_adapt_under_vmap_equals_a_loop(batch):
     adapt = jax.jit(method.adapt)
     for i in range(TASKS):
         alone = adapt(params, jax.tree.map(lambda x, i=i: x[i], batch.support))["policy"]
-        assert_trees_close(jax.tree.map(lambda x, i=i: x[i], together), alone)
+        assert_trees_close(jax.tree.map(lambda x, i=i: np.asarray(x)[i], together), alone)
 
 
 @pytest.mark.parametrize("tasks_at_once", [1, 2])
@@ -249,7 +249,8 @@ def test_imitating_its_own_actions_is_without_loss(batch):
     own = dataclasses.replace(demo, action=jax.jit(act)(demo.image, demo.state))
     assert np.abs(own.action - demo.action).max() > 0.1
     for inner, law in ((False, lambda loss: loss < 1e-12), (True, lambda loss: loss > 1e-3)):
-        loss, _ = method.imitation_loss(task_params["policy"], task_params["whitening"], own, inner=inner)
+        imitation_loss = jax.jit(functools.partial(method.imitation_loss, inner=inner))
+        loss, _ = imitation_loss(task_params["policy"], task_params["whitening"], own)
         assert law(loss), f"inner {inner}: {loss}"
 
 

@@ -66,7 +66,7 @@ def test_the_inner_step_changes_what_the_variant_says_and_nothing_else(batch, va
     )
     params, one = {"policy": policy, "whitening": PLAIN}, jax.tree.map(lambda x: x[0], batch.support)
     before, full, found = (
-        leaves(MIL(MILConfig(inner_lr=lr, variant=kind), network).adapt(params, one)["policy"])
+        leaves(jax.jit(MIL(MILConfig(inner_lr=lr, variant=kind), network).adapt)(params, one)["policy"])
         for lr, kind in ((0.0, "maml"), (ALPHA, "maml"), (ALPHA, variant))
     )
     output = {f"controller.{head}.{name}" for head in ("Dense_2", "Dense_3") for name in ("kernel", "bias")}
@@ -96,7 +96,7 @@ def test_closed_form_of_the_multi_step_loss(batch, progress, weights):
 
 def test_imitation_takes_no_inner_step_and_sees_support_and_query(batch):
     method, params = constant()
-    gradient = jax.grad(lambda params: method.imitation(params, batch)[0])(params)["policy"]
+    gradient = jax.jit(jax.grad(lambda params: method.imitation(params, batch)[0]))(params)["policy"]
     means = [np.asarray(demo.action).mean(axis=(0, 1, 2)) for demo in (batch.support, batch.query)]
     np.testing.assert_allclose(gradient, sum(2 * M**2 / ACTION * (THETA - mean) for mean in means), rtol=1e-12)
     loss, _ = method.imitation(params, batch)

@@ -16,7 +16,7 @@ CONFIG = AttentionConfig(fc_layers=(16,), context=8)
 def networks():
     encoder, actor = ObjectTokens(CONFIG, OBJECTS), AttentiveActor(CONFIG, ACTION, OBJECTS)
     tokens, encoding = encoder.init_with_output(jax.random.key(0), None, jnp.zeros((1, STATE)), jnp.zeros((1, ACTION)))
-    acting = actor.init(jax.random.key(1), tokens, None, jnp.zeros((1, STATE)))["params"]
+    acting = jax.jit(actor.init)(jax.random.key(1), tokens, None, jnp.zeros((1, STATE)))["params"]
 
     @jax.jit
     def attend(state, action, seen):

@@ -91,7 +91,7 @@ def test_no_gradient_reaches_the_fixed_layer_and_adaptation_leaves_it():
     policy = make_policy(CONFIG, (12, 16), 3, 2, goal_size=0)
     method = MIL(MILConfig(inner_lr=0.1, learn_inner_lr=True), policy)
     whitening = Whitening(jnp.zeros(3), jnp.ones(3), jnp.zeros(2), jnp.ones(2))
-    params = method.init(jax.random.key(0), whitening)
+    params = jax.jit(method.init)(jax.random.key(0), whitening)
     bank = fixed_filters.Filters(RNG.normal(size=(3, 3, 3, 6)).astype(np.float32), BIAS)
     params = fixed_filters.put(params, bank)
     layer = params["policy"]["vision"]["ConvBlock_0"]

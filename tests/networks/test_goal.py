@@ -38,8 +38,8 @@ def test_gradient_in_the_filter_is_the_mean_feature_less_the_feature_where_the_g
     def loss(params):
         return head.apply(params, features).negative_log_likelihood(jnp.asarray(goal)).sum()
 
-    gradient = jax.grad(loss)(params)["params"]["kernel"]
-    found = head.apply(params, features)
+    gradient = jax.jit(jax.grad(loss))(params)["params"]["kernel"]
+    found = jax.jit(head.apply)(params, features)
     prior = np.exp(found.log_weight)
     posterior = likelihoods(prior, np.asarray(found.vote), goal)
     posterior /= posterior.sum(axis=-1, keepdims=True)

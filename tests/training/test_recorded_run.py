@@ -56,8 +56,8 @@ def tiny_config(folder):
     config = recorded.config_for(folder, preset="cpu")
     config.recorded.horizon = HORIZON
     config.network.filters, config.network.strides, config.network.fc_layers = (4, 4), (2, 1), (40, 40)
-    config.train.steps, config.train.log_every, config.train.eval_every = 600, 100, 200
-    config.train.meta_batch, config.optimizer.learning_rate = 8, 3e-3
+    config.train.steps, config.train.log_every, config.train.eval_every = 300, 50, 100
+    config.train.meta_batch, config.optimizer.learning_rate = 8, 6e-3
     return config
 
 
@@ -229,6 +229,7 @@ def test_a_run_without_a_finite_update_stops(folder, tmp_path, monkeypatch):
         run.train()
 
 
+@pytest.mark.slow
 def test_where_there_are_no_states_none_are_needed(tmp_path):
     """Goes from the data set to the exported policy, and compares that with `milx.load`."""
     rng = np.random.default_rng(0)

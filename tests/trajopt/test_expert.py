@@ -105,7 +105,7 @@ def test_the_arm_is_driven_by_the_recorded_action_plus_noise(env, demonstrations
 def test_without_a_plan_there_must_be_a_controller(env):
     keys = jax.random.split(jax.random.key(0), 1)
     task = jax.vmap(env.sample_task, in_axes=(0, None))(keys, "train")
-    scene = jax.vmap(env.reset)(keys, task)
+    scene = jax.jit(jax.vmap(env.reset))(keys, task)
     with pytest.raises(ValueError, match=r"data\.plan_iterations: got 0, expected at least 1: reach has no controller"):
         expert.perform(env, task, scene, keys, Options(iterations=0), 0.0)
 
