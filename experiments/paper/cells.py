@@ -244,8 +244,8 @@ class Cells:
         metrics = MetricsWriter(checkpoints.folder.parent, int(state.step), print)
         with contextlib.closing(metrics), stop.listen():
             state = loop.fit(scan, state, key, training, config.train, checkpoints, hooks, clock, stop)
-        if int(state.step) < config.train.steps:
-            raise SystemExit(0)
+        if stop.asked:
+            raise SystemExit(stop.exit_code)
         best = checkpoints.best
         assert best is not None
         params = checkpoints.restore(best, {"params": state.params})[0]["params"]

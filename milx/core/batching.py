@@ -36,7 +36,7 @@ def map_in_chunks(
     results = []
     for start in range(0, total, size):
         index = rows[np.minimum(np.arange(start, start + size), total - 1)]
-        results.append(jax.block_until_ready(function(*_take(inputs, index))))
+        results.append(jax.block_until_ready(function(*parallel.replicate(_take(inputs, index)))))
         if counted:
             progress.advance(size)
     return _join(results, total)
@@ -45,7 +45,7 @@ def map_in_chunks(
 # One program each, instead of one for every shape and operation.
 @jax.jit
 def _take(inputs: tuple, index: np.ndarray) -> tuple:
-    return parallel.replicate(jax.tree.map(lambda x: x[index], inputs))
+    return jax.tree.map(lambda x: x[index], inputs)
 
 
 @functools.partial(jax.jit, static_argnums=1)

@@ -77,13 +77,17 @@ def largest(x: jax.Array) -> jax.Array:
     return jax.lax.pmax(x, AXIS)
 
 
-@jax.jit
 def replicate(tree: Any) -> Any:
     """Places arrays complete on every device, as the results of `shard_tasks` are, inside `jax.jit` or not.
 
     A program is compiled once more for arguments that are placed elsewhere, even if there is only one device.
     """
-    return jax.lax.with_sharding_constraint(tree, NamedSharding(mesh(), PartitionSpec()))
+    return _place(tree, NamedSharding(mesh(), PartitionSpec()))
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def _place(tree: Any, where: NamedSharding) -> Any:
+    return jax.lax.with_sharding_constraint(tree, where)
 
 
 def replicated(shapes: Any) -> Any:

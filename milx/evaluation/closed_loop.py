@@ -174,7 +174,7 @@ def listen(env: Env, method: Method, params: Params, demos: DemoSet, config: Eva
     if count < 2:
         return {}
     params = parallel.replicate(params)
-    support, query = _support_and_query(demos, count, config.shots)
+    support, query = parallel.replicate(_support_and_query(demos, count, config.shots))
     adapt = functools.partial(_adaptation(env, method), params)
     adapted = map_in_chunks(adapt, (support.task, support.states, support.action), config.batch, counted=False)
     found = _compare(env, method, params, adapted, query)
@@ -188,7 +188,7 @@ def _support_and_query(demos: DemoSet, count: int, shots: int) -> tuple[DemoSet,
     rest = demos.states, demos.action, demos.success
     parts = slice(shots), slice(shots, shots + 1)
     support, query = (DemoSet(task, *jax.tree.map(lambda x, part=part: x[:count, part], rest)) for part in parts)
-    return parallel.replicate((support, query))
+    return support, query
 
 
 def _listeners(num_tasks: int) -> int:

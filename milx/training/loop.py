@@ -118,11 +118,11 @@ def fit(
                 last = f"the last good checkpoint is of step {checkpoints.latest}"
                 there = last if checkpoints.latest is not None else "there is no checkpoint"
                 raise ValueError(f"train: no update of the last {in_vain} was finite; {there}")
-            stopping = parallel.on_any_host(stop.asked)
+            stopping = parallel.on_any_host(bool(stop.asked))
             if is_due() or stopping:
                 written = hooks.save(checkpoints.save, state, UNVALIDATED)
         if is_due():  # all there is has been saved
-            stopping = parallel.on_any_host(stop.asked)
+            stopping = parallel.on_any_host(bool(stop.asked))
             if written and not stopping:
                 written = validate()
     if not written:

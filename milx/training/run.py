@@ -111,13 +111,13 @@ class Run(abc.ABC):
     def train(self) -> None:
         """Meta-trains to the configured number of steps, from the latest checkpoint if there is one.
 
-        On SIGTERM it writes a checkpoint after the scan under way, which is not validated, and ends the process; during
-        a validation, before which there is a checkpoint, it ends at once.
+        On SIGTERM, SIGINT or SIGHUP it writes a checkpoint after the scan under way, which is not validated, and ends
+        the process; during a validation, before which there is a checkpoint, it ends at once (see `signals.Stop`).
 
         Raises:
             ValueError: if another process trains in this folder, its checkpoints are all damaged, the last one could
                 not be written, or `loop.MOST_IN_VAIN` updates in a row were skipped because they were not finite.
-            SystemExit: with code 0, after SIGTERM.
+            SystemExit: after a signal, with 128 plus its number.
         """
         stop = signals.Stop()
         with signals.one_trainer(self.folder), stop.listen():
@@ -146,9 +146,9 @@ class Run(abc.ABC):
             with contextlib.closing(metrics), self.phase("meta-training", config.steps, int(state.step)):
                 hooks = self._hooks(metrics, training.dataset_hash)
                 state = loop.fit(scan, state, key, training, config, checkpoints, hooks, self.clock, stop)
-        if int(state.step) < config.steps:
+        if parallel.on_any_host(bool(stop.asked)):
             print(f"milx: stopped at step {int(state.step)}; the same command goes on from there", flush=True)
-            raise SystemExit(0)
+            raise SystemExit(stop.exit_code)
 
     def phase(self, description: str, total: int | None = None, done: int = 0) -> AbstractContextManager[None]:
         """Shows a phase on the console, as `milx.core.progress.phase` does."""

@@ -6,6 +6,7 @@ import os
 import pathlib
 import signal
 import socket
+import sys
 import threading
 from collections.abc import Iterator
 
@@ -32,33 +33,46 @@ def one_trainer(folder: pathlib.Path) -> Iterator[None]:
 
 
 class Stop:
-    """Whether the process was told to end (SIGTERM), as shared machines do before they take a node away.
+    """Which signal told the process to end: SIGTERM, SIGINT (Ctrl-C) or SIGHUP (a terminal that closes).
 
-    Within `deferred` a signal is noted and `asked` becomes true; elsewhere within `listen` it ends the process at once,
-    even while the main thread waits for a device.
+    Within `deferred` a signal is noted, and a second SIGINT ends the process at once; elsewhere within `listen` the
+    first one does, even while the main thread waits for a device. In an interactive session SIGINT raises
+    KeyboardInterrupt there instead. Signals that were ignored before (by `nohup`, for example) remain so. A process
+    that has been stopped exits with 128 plus the number of the signal, as a shell reports it.
     """
 
     def __init__(self) -> None:
-        self.asked = False
+        self.asked = 0
+        """The number of the first signal; 0 before."""
         self._deferred = False
+
+    @property
+    def exit_code(self) -> int:
+        """The code to exit with; that of SIGTERM if another host was told to stop."""
+        return 128 + (self.asked or signal.SIGTERM)
 
     @contextlib.contextmanager
     def listen(self) -> Iterator[None]:
-        """Listens for the signal; not in threads, where Python cannot."""
+        """Listens for the signals; not in threads, where Python cannot."""
         if threading.current_thread() is not threading.main_thread():
             yield
             return
         ours, theirs = socket.socketpair()
         theirs.setblocking(False)
+        before = {number: signal.getsignal(number) for number in _SIGNALS}
+        heard = [number for number in _SIGNALS if before[number] != signal.SIG_IGN]
+        for number in heard:
+            signal.signal(number, self._interrupt)
         # Python's own handlers wait for the main thread; what it writes to a socket, another thread reads at once.
-        before = signal.signal(signal.SIGTERM, lambda *_: None), signal.set_wakeup_fd(theirs.fileno())
+        wakeup = signal.set_wakeup_fd(theirs.fileno())
         watcher = threading.Thread(target=self._watch, args=(ours,), daemon=True)
         watcher.start()
         try:
             yield
         finally:
-            signal.set_wakeup_fd(before[1])
-            signal.signal(signal.SIGTERM, before[0])
+            signal.set_wakeup_fd(wakeup)
+            for number in heard:
+                signal.signal(number, before[number])
             theirs.close()
             watcher.join()
             ours.close()
@@ -72,11 +86,31 @@ class Stop:
         finally:
             self._deferred = False
 
+    def _interrupt(self, number: int, _: object) -> None:
+        """Runs in the main thread, after `_watch` if that is busy."""
+        if number == signal.SIGINT and _is_interactive() and not self._deferred:
+            raise KeyboardInterrupt
+
     def _watch(self, ours: socket.socket) -> None:
         while numbers := ours.recv(64):
-            if signal.SIGTERM in numbers:
-                self.asked = True
-                if not self._deferred:
-                    print("milx: stopped; the same command goes on", flush=True)
-                    # Threads that compile would keep a process alive that ends in the usual way.
-                    os._exit(0)
+            for number in numbers:
+                if number in _SIGNALS:
+                    self._note(number)
+
+    def _note(self, number: int) -> None:
+        again, self.asked = self.asked, self.asked or number
+        if self._deferred and not (again and number == signal.SIGINT):
+            if number == signal.SIGINT:
+                print("milx: stopping after the updates under way; Ctrl-C again ends at once", flush=True)
+        elif number != signal.SIGINT or not _is_interactive():
+            print("milx: stopped; the same command goes on", flush=True)
+            # Threads that compile would keep a process alive that ends in the usual way.
+            os._exit(128 + number)
+
+
+_SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+
+
+def _is_interactive() -> bool:
+    """Tells whether a person has a prompt or a notebook, which must outlive an interrupted run."""
+    return hasattr(sys, "ps1")

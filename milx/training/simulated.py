@@ -133,7 +133,7 @@ def result_of(
 def _firsts(test: DemoSet, trials: Trials) -> tuple[Task, State, State]:
     """Returns the tasks that a video shows, the first demonstration of each and the first trial."""
     task, demo, trial = jax.tree.map(lambda x: x[:_FILMED], (test.task, test.states, trials.states))
-    return parallel.replicate((task, *(jax.tree.map(lambda x: x[:, 0], states) for states in (demo, trial))))
+    return task, *(jax.tree.map(lambda x: x[:, 0], states) for states in (demo, trial))
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -251,6 +251,6 @@ class SimulatedRun(Run):
 
     def _film(self, test: DemoSet, trials: Trials) -> None:
         """Writes the video: demonstrations beside the first trial of the same held-out tasks, in large."""
-        task, demo, trial = _firsts(test, trials)
+        task, demo, trial = parallel.replicate(_firsts(test, trials))
         left, right = (np.asarray(closed_loop.film(self._large, task, states)) for states in (demo, trial))
         plots.side_by_side(left, right, self.folder / VIDEO)

@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import io
 import json
+import signal
 
 import jax
 import jax.numpy as jnp
@@ -122,7 +123,7 @@ def test_an_interrupted_run_ends_bit_for_bit_like_the_uninterrupted_one(
 ):
     """Interrupts a run, also one whose data passes by in shards, of which none is whole."""
     config = tiny_config(folder)
-    config.train.steps, config.train.eval_every = 200, 100
+    config.train.steps, config.train.log_every, config.train.eval_every = 200, 100, 100
     size = 3 * HORIZON * (12 * 16 * 3 + 4 * 5) * 1.01
     config.recorded.gib = 4 * size / 2**30
 
@@ -154,10 +155,12 @@ def test_an_interrupted_run_ends_bit_for_bit_like_the_uninterrupted_one(
 
         patch.setattr(MetricsWriter, "write", terminate)
         patch.setattr(signals.Stop, "listen", contextlib.nullcontext)
-        patch.setattr(signals.Stop, "asked", property(lambda _: bool(told), lambda *_: None), raising=False)
+        patch.setattr(
+            signals.Stop, "asked", property(lambda _: told and signal.SIGTERM, lambda *_: None), raising=False
+        )
         with pytest.raises(SystemExit) as ended:
             final(tmp_path / "terminated")
-    assert ended.value.code == 0
+    assert ended.value.code == 143
     assert "milx: stopped at step 100; the same command goes on from there" in capsys.readouterr().out
     straight = final(tmp_path / "straight")
     best = Checkpoints(tmp_path / "straight" / "checkpoints", read_only=True).best

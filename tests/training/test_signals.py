@@ -42,25 +42,32 @@ def test_a_second_trainer_is_refused_while_the_first_lives_and_admitted_after_it
         pass
 
 
-def test_the_signal_is_noted_where_it_is_deferred_and_what_was_there_before_comes_back():
+NUMBERS = pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP], ids=lambda n: n.name)
+
+
+@NUMBERS
+def test_the_signal_is_noted_where_it_is_deferred_and_what_was_there_before_comes_back(number):
     program = """
-    import os, signal, time
+    import os, signal, sys, time
     from milx.training import signals
-    before, stop = signal.getsignal(signal.SIGTERM), signals.Stop()
+    number = int(sys.argv[1])
+    before, stop = signal.getsignal(number), signals.Stop()
     with stop.listen(), stop.deferred():
-        os.kill(os.getpid(), signal.SIGTERM)
+        os.kill(os.getpid(), number)
         time.sleep(0.5)
-        print(stop.asked, flush=True)
-    print(signal.getsignal(signal.SIGTERM) == before, flush=True)
-    os.kill(os.getpid(), signal.SIGTERM)
+        print(stop.asked == number, stop.exit_code == 128 + number, flush=True)
+    print(signal.getsignal(number) == before, flush=True)
+    signal.signal(number, signal.SIG_DFL)
+    os.kill(os.getpid(), number)
     """
-    process = start(program)
+    process = start(program, int(number))
     out, _ = process.communicate()
-    assert out.split() == ["True", "True"]
-    assert process.returncode == -signal.SIGTERM
+    assert out.split()[-3:] == ["True"] * 3
+    assert process.returncode == -number
 
 
-def test_elsewhere_the_signal_ends_the_process_at_once_and_well():
+@NUMBERS
+def test_elsewhere_the_signal_ends_the_process_at_once_with_its_exit_code(number):
     """Signals while the main thread waits for a program of XLA, and another thread would go on for a minute."""
     program = """
     import threading, time
@@ -76,8 +83,65 @@ def test_elsewhere_the_signal_ends_the_process_at_once_and_well():
     process = start(program)
     assert process.stdout.readline() == "ready\n"
     began = time.monotonic()
-    process.terminate()
+    process.send_signal(number)
     out, _ = process.communicate()
     assert time.monotonic() - began < 10
-    assert process.returncode == 0
+    assert process.returncode == 128 + number
     assert "the same command goes on" in out
+
+
+def test_a_second_interrupt_ends_the_process_at_once_even_where_the_first_is_deferred():
+    program = """
+    import time
+    from milx.training import signals
+    stop = signals.Stop()
+    with stop.listen(), stop.deferred():
+        print("ready", flush=True)
+        time.sleep(0.5)
+        print("going on", flush=True)
+        time.sleep(60)
+    """
+    process = start(program)
+    assert process.stdout.readline() == "ready\n"
+    process.send_signal(signal.SIGINT)
+    assert process.stdout.readline() == "milx: stopping after the updates under way; Ctrl-C again ends at once\n"
+    assert process.stdout.readline() == "going on\n"
+    began = time.monotonic()
+    process.send_signal(signal.SIGINT)
+    process.communicate()
+    assert time.monotonic() - began < 10
+    assert process.returncode == 130
+
+
+def test_signals_that_were_ignored_stay_ignored():
+    """As SIGHUP is under nohup."""
+    program = """
+    import os, signal, time
+    from milx.training import signals
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    stop = signals.Stop()
+    with stop.listen():
+        os.kill(os.getpid(), signal.SIGHUP)
+        time.sleep(0.5)
+        print(stop.asked, flush=True)
+    """
+    process = start(program)
+    out, _ = process.communicate()
+    assert (out, process.returncode) == ("0\n", 0)
+
+
+def test_in_an_interactive_session_an_interrupt_leaves_the_process_alive():
+    program = """
+    import os, signal, sys, time
+    from milx.training import signals
+    sys.ps1 = "> "
+    try:
+        with signals.Stop().listen():
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(60)
+    except KeyboardInterrupt:
+        print("interrupted", flush=True)
+    """
+    process = start(program)
+    out, _ = process.communicate(timeout=30)
+    assert (out, process.returncode) == ("interrupted\n", 0)
