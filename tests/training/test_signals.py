@@ -21,9 +21,14 @@ with signals.one_trainer(pathlib.Path(sys.argv[1])):
 """
 
 
+SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+
+
 def start(program, *arguments):
+    """Starts a Python program that ignores no signal, whatever this process ignores."""
     command = [sys.executable, "-c", textwrap.dedent(program), *map(str, arguments)]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    defaults = lambda: [signal.signal(number, signal.SIG_DFL) for number in SIGNALS]  # noqa: E731
+    return subprocess.Popen(command, stdout=subprocess.PIPE, text=True, preexec_fn=defaults)
 
 
 def test_a_second_trainer_is_refused_while_the_first_lives_and_admitted_after_it_died(tmp_path):
@@ -42,7 +47,7 @@ def test_a_second_trainer_is_refused_while_the_first_lives_and_admitted_after_it
         pass
 
 
-NUMBERS = pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP], ids=lambda n: n.name)
+NUMBERS = pytest.mark.parametrize("number", SIGNALS, ids=lambda number: number.name)
 
 
 @NUMBERS
