@@ -90,7 +90,7 @@ def _place(tree: Any, where: NamedSharding) -> Any:
     return jax.lax.with_sharding_constraint(tree, where)
 
 
-def replicated(shapes: Any) -> Any:
+def replicated_shapes(shapes: Any) -> Any:
     """Returns the shapes (of arrays or of `jax.eval_shape`) of what `replicate` has placed."""
     everywhere = NamedSharding(mesh(), PartitionSpec())
 
@@ -124,6 +124,6 @@ def shard_tasks(function: Callable[..., Any], *, shared: int = 0, average: bool 
         out = everywhere if average else sharded
         # Scans in milx start from constants, which the check of varying axes (check_vma) would reject.
         result = jax.shard_map(on_each, mesh=mesh(), in_specs=specs, out_specs=out, check_vma=False)(*args)
-        return jax.lax.with_sharding_constraint(result, NamedSharding(mesh(), everywhere))
+        return replicate(result)
 
     return call

@@ -143,14 +143,14 @@ def precompile(env: Env, method: Method, params: Params, config: EvalConfig, tri
     `params` may be shapes.
     """
     size = parallel.round_up(config.batch)
-    params, batch = parallel.replicated((params, shapes(env, size, config.shots)))
+    params, batch = parallel.replicated_shapes((params, shapes(env, size, config.shots)))
     adaptation = _adaptation(env, method)
     shown = params, batch.task, batch.states, batch.action
     adaptation.lower(*shown).compile()
-    task_params = parallel.replicated(jax.eval_shape(adaptation, *shown))
+    task_params = parallel.replicated_shapes(jax.eval_shape(adaptation, *shown))
     for count in trials:
         inputs = _trial_inputs.eval_shape(env, batch, jax.random.key(0), config.shots, count, False, None)
-        starts = parallel.replicated(inputs[-2:])
+        starts = parallel.replicated_shapes(inputs[-2:])
         _acting(env, method).lower(task_params, batch.task, *starts).compile()
 
 
@@ -199,9 +199,11 @@ def _listeners(num_tasks: int) -> int:
 def precompile_listen(env: Env, method: Method, params: Params, config: EvalConfig) -> None:
     """Compiles what `listen` runs after an adaptation, into the compilation cache; `params` may be shapes."""
     if (count := _listeners(config.validation_tasks)) >= 2:
-        params, support, query = parallel.replicated((params, shapes(env, count, config.shots), shapes(env, count, 1)))
+        params, support, query = parallel.replicated_shapes(
+            (params, shapes(env, count, config.shots), shapes(env, count, 1))
+        )
         shown = params, support.task, support.states, support.action
-        adapted = parallel.replicated(jax.eval_shape(_adaptation(env, method), *shown))
+        adapted = parallel.replicated_shapes(jax.eval_shape(_adaptation(env, method), *shown))
         _compare.lower(env, method, params, adapted, query).compile()
 
 
@@ -281,7 +283,7 @@ def precompile_film(camera: Env, num_tasks: int) -> None:
     """Compiles what `film` runs for so many tasks, into the compilation cache."""
     demos = shapes(camera, num_tasks, 1)
     states = jax.tree.map(lambda x: jax.ShapeDtypeStruct((num_tasks, *x.shape[2:]), x.dtype), demos.states)
-    film.lower(camera, *parallel.replicated((demos.task, states))).compile()
+    film.lower(camera, *parallel.replicated_shapes((demos.task, states))).compile()
 
 
 def summarize(
