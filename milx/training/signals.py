@@ -10,6 +10,9 @@ import sys
 import threading
 from collections.abc import Iterator
 
+_SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+"""The signals that tell a run to stop."""
+
 
 @contextlib.contextmanager
 def one_trainer(folder: pathlib.Path) -> Iterator[None]:
@@ -87,7 +90,7 @@ class Stop:
             self._deferred = False
 
     def _interrupt(self, number: int, _: object) -> None:
-        """Runs in the main thread, after `_watch` if that is busy."""
+        """Runs in the main thread once that is back in Python; `_watch` does the rest in its own thread."""
         if number == signal.SIGINT and _is_interactive() and not self._deferred:
             raise KeyboardInterrupt
 
@@ -100,15 +103,12 @@ class Stop:
     def _note(self, number: int) -> None:
         again, self.asked = self.asked, self.asked or number
         if self._deferred and not (again and number == signal.SIGINT):
-            if number == signal.SIGINT:
+            if number == signal.SIGINT and not _is_interactive():
                 print("milx: stopping after the updates under way; Ctrl-C again ends at once", flush=True)
         elif number != signal.SIGINT or not _is_interactive():
             print("milx: stopped; the same command goes on", flush=True)
             # Threads that compile would keep a process alive that ends in the usual way.
             os._exit(128 + number)
-
-
-_SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
 
 def _is_interactive() -> bool:
