@@ -109,7 +109,8 @@ def _arrange(tasks: Task, states: State, action: jax.Array, success: jax.Array) 
     keep = lambda x: jnp.where(finite.reshape(-1, *[1] * (x.ndim - 1)), x, jnp.zeros((), x.dtype))  # noqa: E731
     kept = *jax.tree.map(keep, (states, action)), success & finite
     num_tasks = len(jax.tree.leaves(tasks)[0])
-    of_task = jax.tree.map(lambda x: x.reshape(num_tasks, -1, *x.shape[1:]), kept)
+    shape = num_tasks, len(success) // num_tasks  # in full, as -1 stands for nothing where a leaf is empty
+    of_task = jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), kept)
     order = jnp.argsort(~of_task[-1], axis=1)
     rows = jnp.arange(num_tasks)[:, None]
     return DemoSet(tasks, *jax.tree.map(lambda x: x[rows, order], of_task)), (~finite).sum()
