@@ -1,6 +1,7 @@
 """What the launchers share: flags that everybody sets, and overrides of single configuration fields."""
 
 import functools
+import gc
 import os
 import pathlib
 import sys
@@ -52,6 +53,9 @@ def run(main: Callable[[Config, str], None]) -> None:
     Bad input ends with a message, not a traceback.
     """
     platform.configure()
+    # Tracing makes millions of objects, hardly any of them in cycles, which Python would search for all the time.
+    gc.freeze()
+    gc.set_threshold(100_000, 50, 50)
 
     def parse_or_exit(argv: Sequence[str]) -> list[str]:
         try:

@@ -142,7 +142,7 @@ class Trainer:
         def gradient(
             params: Params, data: Any, step: jax.Array, keys: jax.Array
         ) -> tuple[Params, dict[str, jax.Array]]:
-            batch = self.sample(data, keys)
+            batch = self._batch(data, keys)
             grad, metrics = self._gradient(params, batch, step)
             task = jnp.zeros_like(metrics["loss"]) if batch.task is None else batch.task.astype(metrics["loss"].dtype)
             bad = parallel.largest(jnp.where(jnp.isfinite(metrics["loss"]), -1, task).max())
@@ -164,6 +164,10 @@ class Trainer:
     def _keys(self, key: jax.Array, step: jax.Array) -> jax.Array:
         """Splits the keys [N] that draw the batch of a step."""
         return jax.random.split(jax.random.fold_in(key, step), self.train.meta_batch)
+
+    @functools.partial(jax.jit, static_argnums=0)  # so that `run`, which draws twice, traces it once
+    def _batch(self, data: Any, keys: jax.Array) -> TaskBatch:
+        return self.sample(data, keys)
 
     def _gradient(self, params: Params, batch: TaskBatch, step: jax.Array) -> tuple[Params, dict[str, jax.Array]]:
         """Computes the gradient of plain imitation for the first updates, if configured, then of the meta-objective."""
@@ -190,7 +194,7 @@ class Trainer:
         state, metrics = jax.lax.scan(lambda s, _: self.update(s, data, key), state, length=steps)
         skipped, bad_task = metrics.pop("skipped").sum(), metrics.pop("bad_task").max()
         means = {name: value.sum() / jnp.maximum(steps - skipped, 1) for name, value in metrics.items()}
-        batch = parallel.shard_tasks(self.sample, shared=1)(data, self._keys(key, state.step))
+        batch = parallel.shard_tasks(self._batch, shared=1)(data, self._keys(key, state.step))
         return state, {
             **means,
             **listening.measure(self.method, state.params, batch),
