@@ -6,13 +6,13 @@ This command writes evaluation.json and the plot in the run's folder anew, and t
 """
 
 import pathlib
-import sys
 
 from absl import app, flags, logging
 
 from milx.config import assemble
 from milx.config.registry import load_plugins
 from milx.core import platform
+from milx.core.messages import fail
 from milx.training.factory import make_run
 
 _WORKDIR = flags.DEFINE_string("workdir", None, "Folder of the run.", required=True)
@@ -27,12 +27,12 @@ def main(argv: list[str]) -> None:
     load_plugins()
     path = pathlib.Path(_WORKDIR.value) / "config.json"
     if not path.is_file():
-        sys.exit(f"milx: workdir: {path.parent} has no config.json, expected a folder of `python -m milx.train`")
+        fail(f"workdir: {path.parent} has no config.json, expected a folder of `python -m milx.train`")
     try:
         run = make_run(assemble.read(path), path.parent)
         run.report(run.evaluate())
-    except (ValueError, OSError) as error:
-        sys.exit(f"milx: {error}")
+    except (ValueError, OSError, RuntimeError) as error:  # the last if JAX finds no device
+        fail(error)
 
 
 if __name__ == "__main__":

@@ -4,11 +4,11 @@ python -m milx.export runs/reach-mil-fast-0 exported
 """
 
 import pathlib
-import sys
 
 from absl import app, flags, logging
 
 from milx.core import platform
+from milx.core.messages import fail
 from milx.deploy.export import export
 from milx.deploy.pretrained import load
 
@@ -21,8 +21,8 @@ def main(argv: list[str]) -> None:
     platform.configure()
     try:
         export(load(argv[1]), argv[2], flags.FLAGS.shots)
-    except (ValueError, OSError) as error:
-        sys.exit(f"milx: {error}")
+    except (ValueError, OSError, RuntimeError) as error:  # the last if JAX finds no device
+        fail(error)
     size = sum(path.stat().st_size for path in pathlib.Path(argv[2]).iterdir())
     print(f"{argv[2]}: {size / 1e6:.1f} MB. To load it, use `from policy import Policy` in that folder.")
 

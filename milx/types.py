@@ -6,6 +6,7 @@ Letters used in shapes throughout the project:
 """
 
 import dataclasses
+import math
 from typing import Any
 
 import jax
@@ -107,14 +108,62 @@ class Spec:
     height_index: int | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns the fields as a dictionary that can be written as JSON."""
-        return dataclasses.asdict(self)
+        """Returns the fields as a dictionary that can be written as JSON, with the version of their layout."""
+        return {"spec_version": 1, **dataclasses.asdict(self)}
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> "Spec":
-        """Builds a `Spec` from the result of `to_dict`, which may have been written to JSON and read back."""
-        return cls(**{name: _as_tuple(value) for name, value in values.items()})
+        """Builds a `Spec` from the result of `to_dict`, which may have been written to JSON and read back.
+
+        Raises:
+            ValueError: for a field that is missing, does not exist, or has a value that is not possible.
+        """
+        if not isinstance(values, dict):
+            raise ValueError(f"spec: got {values!r:.100}, expected a group of fields")
+        version = values.get("spec_version", 1)  # the first specs had no version
+        if version != 1:
+            raise ValueError(f"spec_version: got {version!r:.100}, expected 1: made by a later milx")
+        fields = {name: _as_tuple(value) for name, value in values.items() if name != "spec_version"}
+        known = {field.name: field.default is dataclasses.MISSING for field in dataclasses.fields(cls)}
+        for name in fields.keys() - known.keys():
+            raise ValueError(f"{name!r:.100}: no such field, expected some of {', '.join(known)}")
+        for name in known:
+            if known[name] and name not in fields:
+                raise ValueError(f"{name}: missing, expected a value")
+        spec = cls(**fields)
+        size, actions = (value if type(value) is int else 0 for value in (spec.state_size, spec.action_size))
+        goal, objects = (len(x) if isinstance(x, tuple) else 0 for x in (spec.goal_indices, spec.object_indices))
+        good = {
+            "image_shape": spec.image_shape is None or _is_table(spec.image_shape, (2,), 1, _LARGEST),
+            "state_size": _is_table((spec.state_size,), (1,), 0, _LARGEST),
+            "action_size": _is_table((spec.action_size,), (1,), 1, _LARGEST),
+            "action_range": spec.action_range is None or _is_table(spec.action_range, (2, actions)),
+            "goal_indices": _is_table(spec.goal_indices, (goal,), 0, size),
+            "image_to_goal": spec.image_to_goal is None or _is_table(spec.image_to_goal, (3, goal)),
+            "object_indices": _is_table(spec.object_indices, (objects, 2), 0, size),
+            "height_index": spec.height_index is None or _is_table((spec.height_index,), (1,), 0, size),
+        }
+        for name in (name for name, value in good.items() if not value):
+            raise ValueError(f"{name}: got {getattr(spec, name)!r:.100}, expected what a policy of these sizes has")
+        return spec
+
+
+_LARGEST = 1 << 20
+"""More than any size of a policy."""
 
 
 def _as_tuple(value: Any) -> Any:
     return tuple(_as_tuple(each) for each in value) if isinstance(value, list) else value
+
+
+def _is_table(value: Any, shape: tuple[int, ...], low: int | None = None, high: int = 0) -> bool:
+    """Tells whether a value is a nested tuple of this shape: finite numbers, or integers from `low` below `high`."""
+    if shape:
+        return (
+            isinstance(value, tuple)
+            and len(value) == shape[0]
+            and all(_is_table(each, shape[1:], low, high) for each in value)
+        )
+    if low is None:
+        return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    return type(value) is int and low <= value < high

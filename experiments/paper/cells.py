@@ -23,7 +23,7 @@ from milx import envs, methods
 from milx.config import assemble
 from milx.config.assemble import make_config
 from milx.config.schema import Config
-from milx.core import pytrees
+from milx.core import files, pytrees
 from milx.core.checkpoint import Checkpoints
 from milx.data import simulated as demos_lib
 from milx.data.simulated import DemoSet
@@ -173,7 +173,7 @@ class Cells:
     def write(self, name: str, result: dict[str, Any]) -> None:
         """Writes a cell's file."""
         self.folder.mkdir(parents=True, exist_ok=True)
-        results.write_json(self.folder / f"{name}.json", result)
+        files.write_json(self.folder / f"{name}.json", result)
 
     def forget(self) -> None:
         """Deletes the checkpoints of the cells trained so far, once they have their files."""
@@ -204,7 +204,7 @@ class Cells:
         training = training_on(self._env(config), config, repeated)._replace(dataset_hash=identity)
         folder = self.folder / "unfinished" / identity
         folder.mkdir(parents=True, exist_ok=True)
-        with signals.one_trainer(folder), contextlib.closing(Checkpoints(folder / "checkpoints")) as checkpoints:
+        with files.locked(folder / "lock"), contextlib.closing(Checkpoints(folder / "checkpoints")) as checkpoints:
             trained = self._fit(name, config, training, checkpoints)
         self._unneeded.append(folder)
         return trained

@@ -17,8 +17,9 @@ from absl import app, flags
 import milx
 from milx import envs
 from milx.config.schema import DataConfig, EvalConfig
+from milx.core import files
 from milx.data.simulated import collect
-from milx.evaluation import provenance, results
+from milx.evaluation import provenance
 from milx.evaluation.closed_loop import evaluate_baselines
 from milx.evaluation.intervals import wilson_interval
 
@@ -69,7 +70,7 @@ def main(_: list[str]) -> None:
         path = folder / f"push-{name}.json"
         if not path.is_file():
             contents = {"expert": name, "scenes": _SCENES.value, "ilqr_iterations": EXPERTS[name]}
-            results.write_json(path, contents | {"runs": compare(name, _SCENES.value)} | provenance.origin())
+            files.write_json(path, contents | {"runs": compare(name, _SCENES.value)} | provenance.origin())
 
 
 if __name__ == "__main__":

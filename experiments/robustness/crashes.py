@@ -22,11 +22,11 @@ from absl import app, flags, logging
 from rich.console import Console
 
 from milx.config import assemble
-from milx.core import pytrees
+from milx.core import files, pytrees
 from milx.core.checkpoint import Checkpoints
 from milx.data.dataset import Writer
 from milx.deploy import policy
-from milx.evaluation import provenance, results
+from milx.evaluation import provenance
 from milx.training.recorded import RecordedRun
 from milx.types import Demo
 
@@ -161,7 +161,7 @@ def main(_: list[str]) -> None:
     same = {"rounds": rounds, "kills": len(kills), "while_writing": sum(found["while_writing"] for found in kills)}
     report = {"same_parameters": same, "undisturbed_s": round(longest, 1), "kills": kills, "terminations": terms}
     pathlib.Path(_OUT.value).mkdir(parents=True, exist_ok=True)
-    results.write_json(pathlib.Path(_OUT.value) / "crashes-cpu.json", report | provenance.origin())
+    files.write_json(pathlib.Path(_OUT.value) / "crashes-cpu.json", report | provenance.origin())
     print(same)
 
 

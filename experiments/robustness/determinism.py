@@ -21,9 +21,9 @@ import numpy as np
 from absl import app, flags, logging
 
 import milx
-from milx.core import pytrees
+from milx.core import files, pytrees
 from milx.deploy import policy
-from milx.evaluation import provenance, results
+from milx.evaluation import provenance
 from milx.training.metrics import read_metrics
 
 _OUT = flags.DEFINE_string("out", "experiments/results/robustness", "Folder of the JSON file.")
@@ -104,7 +104,7 @@ def main(_: list[str]) -> None:
                 rows.append(row)
                 print(json.dumps(row), flush=True)
                 file = f"determinism{'-cpu' if jax.default_backend() == 'cpu' else ''}.json"
-                results.write_json(folder / file, {"rows": rows} | provenance.origin())
+                files.write_json(folder / file, {"rows": rows} | provenance.origin())
 
 
 if __name__ == "__main__":

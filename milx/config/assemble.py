@@ -8,7 +8,6 @@ fields that the method does not have; they are ignored. Anywhere else such a fie
 
 import dataclasses
 import functools
-import json
 import pathlib
 import typing
 from typing import Any
@@ -17,6 +16,7 @@ from milx.config.check import check_config
 from milx.config.migrate import VERSION, migrate
 from milx.config.registry import METHODS, PRESETS
 from milx.config.schema import Config
+from milx.core import files
 
 
 def make_config(env: str, method: str = "mil", preset: str = "fast", seed: int = 0) -> Config:
@@ -83,12 +83,13 @@ def read(path: pathlib.Path) -> Config:
     """Reads the configuration in a JSON file.
 
     Raises:
-        ValueError: if the file holds no valid configuration; the message names the file.
+        FileError: if the file cannot be read or holds no valid configuration; the message names the file.
     """
+    values = files.read_json(path)
     try:
-        return from_dict(json.loads(path.read_text()))
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: expected a configuration: {error}") from error
+        return from_dict(values)
+    except (ValueError, TypeError, RecursionError) as error:
+        raise files.FileError(f"{path}: expected a configuration: {error}") from error
 
 
 def fields(config: Config) -> dict[str, Any]:

@@ -5,9 +5,7 @@ to `damaged/` beside the folder of checkpoints. Nothing is lost, and checkpoints
 """
 
 import contextlib
-import hashlib
-import json
-import os
+import math
 import pathlib
 import shutil
 import sys
@@ -21,10 +19,13 @@ import numpy as np
 import orbax.checkpoint as ocp
 from orbax.checkpoint import checkpoint_managers as policies
 
-from milx.core import parallel
+from milx.core import files, parallel
+from milx.core.files import FileError
 
 UNVALIDATED = -1e9
 """The score of a checkpoint that has not been validated: it is the best one only if there is no other."""
+FORMAT = 1
+"""The number of what `Checkpoints.save` writes."""
 _CHECKSUMS = "checksums.json"
 _METADATA = "_CHECKPOINT_METADATA"
 
@@ -76,7 +77,7 @@ class Checkpoints:
             Whether the checkpoint was written.
         """
         saves = {name: ocp.args.StandardSave(jax.tree.map(_stored, tree)) for name, tree in items.items()}
-        args = ocp.args.Composite(**saves, extra=ocp.args.JsonSave(extra))
+        args = ocp.args.Composite(**saves, extra=ocp.args.JsonSave({"format": FORMAT, **extra}))
         try:
             self._manager.save(step, args=args, metrics={"success": score})
             self._manager.wait_until_finished()
@@ -105,7 +106,7 @@ class Checkpoints:
             The items and the extra values.
 
         Raises:
-            ValueError: if the checkpoint does not hold these items.
+            FileError: if the checkpoint does not hold these items.
         """
         restores = {name: ocp.args.StandardRestore(jax.tree.map(_stored, tree)) for name, tree in like.items()}
         try:
@@ -113,12 +114,13 @@ class Checkpoints:
         except Exception as error:  # Orbax and TensorStore raise many types of errors
             reason = f"{type(error).__name__}: {str(error).strip().splitlines()[0]}"
             expected = f"what this version of milx writes; it is of {self._origin(step)}"
-            raise ValueError(
-                f"{self.folder / str(step)}: cannot be restored, expected {expected} ({reason})"
-            ) from error
+            raise FileError(f"{self.folder / str(step)}: cannot be restored, expected {expected} ({reason})") from error
+        extra = restored["extra"]
+        if not isinstance(extra, dict) or extra.pop("format", 1) != FORMAT:  # the first had no number
+            raise FileError(f"{self.folder / str(step)}: expected format {FORMAT}: made by a later milx")
         # Orbax commits arrays to a device. Programs that were compiled for uncommitted arrays would be compiled again.
         free = lambda like, x: jnp.asarray(np.asarray(x) if like.size else np.zeros(like.shape, like.dtype))  # noqa: E731
-        return {name: jax.tree.map(free, like[name], restored[name]) for name in like}, restored["extra"]
+        return {name: jax.tree.map(free, like[name], restored[name]) for name in like}, extra
 
     def replace(self, step: int, items: dict[str, Any], score: float, extra: dict[str, Any]) -> bool:
         """Writes the checkpoint of a step again, for example with its score; a copy is kept until this is done.
@@ -243,27 +245,40 @@ def _damage(checkpoint: pathlib.Path) -> str | None:
     if not path.is_file():
         return _unreadable(checkpoint)
     try:
-        expected = dict(json.loads(path.read_text()))
-        found = _checksums(checkpoint)
-    except FileNotFoundError as error:
-        return f"{error.filename} has vanished"
-    except (ValueError, TypeError, RecursionError):
+        expected = dict(files.read_json(path))
+    except (ValueError, TypeError):
         return f"{_CHECKSUMS} holds no checksums"
+    try:
+        found = _checksums(checkpoint)
+    except FileError as error:
+        return str(error)
     for name in sorted(expected):
         if name not in found:
             return f"{name} is missing"
         if found[name] != expected[name]:
             return f"{name} has changed"
-    return None if expected else f"{_CHECKSUMS} is empty"
+    return _bad_score(checkpoint) if expected else f"{_CHECKSUMS} is empty"
+
+
+def _bad_score(checkpoint: pathlib.Path) -> str | None:
+    """Describes what is wrong with the score by which Orbax ranks a checkpoint; returns None if it is a number."""
+    try:
+        values = files.read_json(checkpoint / "metrics" / "metrics")
+    except FileError as error:
+        return str(error)
+    score = values.get("success") if isinstance(values, dict) else None
+    return (
+        None if isinstance(score, int | float) and math.isfinite(score) else f"its score is {score!r:.100}, no number"
+    )
 
 
 def _unreadable(checkpoint: pathlib.Path) -> str | None:
     """Describes why a checkpoint without checksums cannot be read; returns None if it can."""
     for path in (checkpoint / "metrics" / "metrics", checkpoint / "extra" / "metadata"):
         try:
-            json.loads(path.read_text())
-        except (OSError, ValueError, RecursionError) as error:
-            return f"{path.relative_to(checkpoint)} cannot be read ({type(error).__name__})"
+            files.read_json(path)
+        except FileError as error:
+            return f"{path.relative_to(checkpoint)} cannot be read ({error})"
     with contextlib.closing(ocp.StandardCheckpointer()) as reader:
         for item in sorted(path.parent for path in checkpoint.glob("*/manifest.ocdbt")):
             try:
@@ -274,17 +289,12 @@ def _unreadable(checkpoint: pathlib.Path) -> str | None:
 
 
 def _checksums(checkpoint: pathlib.Path) -> dict[str, str]:
-    files = sorted(path for path in checkpoint.rglob("*") if path.is_file() and _CHECKSUMS not in path.name)
-    return {str(path.relative_to(checkpoint)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+    paths = sorted(path for path in checkpoint.rglob("*") if path.is_file() and _CHECKSUMS not in path.name)
+    return {str(path.relative_to(checkpoint)): files.sha256(path) for path in paths}
 
 
 def _write_checksums(checkpoint: pathlib.Path) -> None:
-    partial = checkpoint / f"{_CHECKSUMS}.partial"
-    with partial.open("w") as file:
-        file.write(json.dumps(_checksums(checkpoint), indent=1))
-        file.flush()
-        os.fsync(file.fileno())
-    partial.replace(checkpoint / _CHECKSUMS)
+    files.write_json(checkpoint / _CHECKSUMS, _checksums(checkpoint))
 
 
 def _move_aside(checkpoint: pathlib.Path) -> None:

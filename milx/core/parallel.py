@@ -27,11 +27,20 @@ def join_hosts(coordinator: str | None = None, processes: int | None = None, pro
         coordinator: the first host's "address:port".
         processes: number of hosts.
         process: this host's number, from 0.
+
+    Raises:
+        ValueError: if the hosts cannot be found, for example because environment variables are not what SLURM sets.
     """
-    slurm = int(os.environ.get("SLURM_STEP_NUM_TASKS", "1")) > 1
+    tasks = os.environ.get("SLURM_STEP_NUM_TASKS", "1")
+    if not tasks.isdecimal():
+        raise ValueError(f"SLURM_STEP_NUM_TASKS: got {tasks!r}, expected a number, as SLURM sets it")
     pod = "," in os.environ.get("TPU_WORKER_HOSTNAMES", "")
-    if coordinator or slurm or pod:
+    if not (coordinator or int(tasks) > 1 or pod):
+        return
+    try:
         jax.distributed.initialize(coordinator, processes, process)
+    except Exception as error:  # what JAX finds in the environment decides on the type
+        raise ValueError(f"hosts: cannot be joined, expected addresses that answer: {error!r:.300}") from error
 
 
 def is_first_host() -> bool:

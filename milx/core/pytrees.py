@@ -1,10 +1,8 @@
 """Pytrees of arrays: the arrays' names, a hash of their contents, and files that store them."""
 
 import hashlib
-import os
 import pathlib
 import sys
-import zipfile
 from collections.abc import Callable
 from typing import Any
 
@@ -12,7 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from milx.core import parallel
+from milx.core import files, parallel
+from milx.core.files import FileError
 
 
 def leaves(tree: Any) -> dict[str, Any]:
@@ -32,45 +31,48 @@ def fingerprint(tree: Any) -> str:
 
 
 def write(path: pathlib.Path, tree: Any) -> None:
-    """Writes a pytree as one .npz file; an existing file is replaced only when the new one is complete."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_suffix(f".partial{os.getpid()}.npz")
-    arrays: dict[str, Any] = {name: np.asarray(leaf) for name, leaf in leaves(tree).items()}
-    np.savez_compressed(partial, **arrays)
-    partial.replace(path)
+    """Writes a pytree as one .npz file; an existing file is replaced only when the new one is complete.
+
+    Raises:
+        FileError: if it cannot be written.
+    """
+    files.write_arrays(path, {name: np.asarray(leaf) for name, leaf in leaves(tree).items()})
 
 
 def read(path: pathlib.Path, like: Any) -> Any:
-    """Reads a pytree written by `save`.
+    """Reads a pytree written by `write`.
 
     Args:
         path: the .npz file.
         like: a pytree (of arrays or shapes) with the expected names, types and shapes, e.g. from `jax.eval_shape`.
 
     Raises:
-        ValueError: if an array is missing or has another type or shape; the message names the array.
+        FileError: if the file cannot be read, or an array is missing or has another type or shape; the message names
+            the array.
     """
-    loaded = []
-    with np.load(path, allow_pickle=False) as arrays:
-        for name, expected in leaves(like).items():
-            if name not in arrays:
-                raise ValueError(f"{path}: {name}: missing, expected {expected.dtype} {expected.shape}")
-            array = arrays[name]
-            if array.shape != expected.shape or array.dtype != expected.dtype:
-                raise ValueError(
-                    f"{path}: {name}: got {array.dtype} {array.shape}, expected {expected.dtype} {expected.shape}"
-                )
-            loaded.append(jnp.asarray(array))
+    loaded, arrays = [], files.read_arrays(path)
+    for name, expected in leaves(like).items():
+        if name not in arrays:
+            raise FileError(f"{path}: {name}: missing, expected {expected.dtype} {expected.shape}")
+        array = arrays[name]
+        if array.shape != expected.shape or array.dtype != expected.dtype:
+            raise FileError(
+                f"{path}: {name}: got {array.dtype} {array.shape}, expected {expected.dtype} {expected.shape}"
+            )
+        loaded.append(jnp.asarray(array))
     return jax.tree.unflatten(jax.tree.structure(like), loaded)
 
 
 def kept(path: pathlib.Path, make: Callable[[], Any], like: Callable[[], Any]) -> Any:
-    """Loads the pytree at `path`, or makes it and saves it there. A damaged file is reported and written again.
+    """Loads the pytree at `path`, or makes it and writes it there.
+
+    A damaged file is reported and written again. One that cannot be written, for example on a full disk, is reported,
+    too, and the pytree that was made is returned all the same.
 
     Args:
         path: the .npz file.
         make: returns the pytree.
-        like: returns a pytree of shapes with the same structure, as `load` needs it.
+        like: returns a pytree of shapes with the same structure, as `read` needs it.
 
     Returns:
         The pytree.
@@ -78,8 +80,11 @@ def kept(path: pathlib.Path, make: Callable[[], Any], like: Callable[[], Any]) -
     if parallel.on_all_hosts(path.is_file()):
         try:
             return read(path, like())
-        except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
-            print(f"milx: {path} is damaged and made again: {error}", file=sys.stderr)
+        except FileError as error:
+            print(f"milx: what it holds is made again: {error}", file=sys.stderr)
     tree = make()
-    write(path, tree)
+    try:
+        write(path, tree)
+    except FileError as error:
+        print(f"milx: what has been made is not kept: {error}", file=sys.stderr)
     return tree

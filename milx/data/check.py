@@ -1,12 +1,11 @@
 """Looks at a data set and says what will go wrong: python -m milx.data.check PATH."""
 
-import sys
-
 import numpy as np
 from absl import app
 from rich.console import Console
 from rich.table import Table
 
+from milx.core.messages import fail, printable
 from milx.data.dataset import DataSet, check_size
 from milx.methods.whitening import MIN_STD
 from milx.types import SPLITS
@@ -72,14 +71,15 @@ def describe(data: DataSet, console: Console) -> None:
     head = data.header
     lengths = [length for task in head.tasks for length in task.lengths]
     console.print(
-        f"{data.folder}: {len(head.tasks)} tasks, {len(lengths)} demonstrations, from {head.source or 'unknown'}"
+        f"{data.folder}: {len(head.tasks)} tasks, {len(lengths)} demonstrations, "
+        f"from {printable(head.source) or 'unknown'}"
     )
     image = "no images" if head.image_shape is None else f"images {head.image_shape[0]} x {head.image_shape[1]}"
     if lengths:
         median = int(np.median(lengths))
         console.print(f"{image}; {min(lengths)} to {max(lengths)} steps, half of them at most {median}")
     for split in SPLITS:
-        names = [head.tasks[i].name for i in head.of_split(split)]
+        names = [printable(head.tasks[i].name) for i in head.of_split(split)]
         console.print(
             f"{split}: {len(names)} tasks{': ' if names else ''}{', '.join(names[:5])}{' ...' if names[5:] else ''}"
         )
@@ -102,7 +102,7 @@ def main(argv: list[str]) -> None:
         describe(data, console)
         found = problems(data)
     except (ValueError, OSError) as error:
-        sys.exit(f"milx: {error}")
+        fail(error)
     for problem in found:
         console.print(f"- {problem}")
     if not found:

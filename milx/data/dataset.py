@@ -11,24 +11,24 @@ Every chunk carries a checksum, so one that has changed or is missing is noticed
 The header names every task, its split ("train", "validation" or "test") and the lengths of its demonstrations.
 """
 
+import contextlib
 import dataclasses
 import hashlib
 import json
 import math
 import pathlib
-import shutil
 from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
 import tensorstore as ts
 
+from milx.core import files
+from milx.core.files import MAX_BYTES, FileError
 from milx.types import SPLITS, Demo
 
 VERSION = 1
 ALL_FIELDS = ("image", "state", "action")
-MAX_BYTES = 1 << 33
-"""Maximum size of an array that has to be in memory at once: a larger one is refused before memory is allocated."""
 _CHUNK_BYTES = 1 << 20
 _MAX_CHUNK_BYTES = 1 << 28
 _GROUP = {"zarr_format": 3, "node_type": "group"}
@@ -106,22 +106,19 @@ class Writer:
             raise ValueError(f"action_size: got {action_size}, expected at least 1: there is nothing to imitate")
         self._header = Header(image_shape, state_size, action_size, (), source)
         self._tasks: list[TaskInfo] = []
-        self._partial = self.folder.with_name(f"{self.folder.name}.partial")
+        self._stack = contextlib.ExitStack()
 
     def __enter__(self) -> "Writer":
         """Starts from nothing; what an earlier attempt left unfinished is removed."""
-        shutil.rmtree(self._partial, ignore_errors=True)
-        self._partial.mkdir(parents=True)
+        self._partial = self._stack.enter_context(files.creating(self.folder))
         return self
 
-    def __exit__(self, kind: type | None, *_: Any) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *error: Any) -> None:
         """Puts the folder in its place, or removes what was written if something went wrong."""
-        if kind is not None:
-            shutil.rmtree(self._partial, ignore_errors=True)
-            return
-        header = dataclasses.replace(self._header, tasks=tuple(self._tasks))
-        _write_group(self._partial, {"milx": {"version": VERSION, **dataclasses.asdict(header)}})
-        self._partial.rename(self.folder)
+        if kind is None:
+            header = dataclasses.replace(self._header, tasks=tuple(self._tasks))
+            _write_group(self._partial, {"milx": {"version": VERSION, **dataclasses.asdict(header)}})
+        self._stack.__exit__(kind, *error)
 
     def add(self, name: str, split: str, lengths: list[int], demos: Iterable[Demo]) -> None:
         """Writes a task.
@@ -134,7 +131,7 @@ class Writer:
 
         Raises:
             ValueError: for a split that does not exist, or a demonstration without time steps or of another shape than
-                announced.
+                announced, or if it cannot be written.
         """
         if 0 in lengths:
             raise ValueError(f"demonstration {lengths.index(0)} of {name!r}: got no time steps, expected at least one")
@@ -159,7 +156,10 @@ class Writer:
                 if value.dtype != np.uint8 if field == "image" else value.dtype.kind not in "fiu":
                     wanted = "uint8 in [0, 255]" if field == "image" else "real numbers"
                     raise ValueError(f"{where}: got {value.dtype}, expected {wanted}")
-                array[start : start + length].write(value.astype(array.dtype.numpy_dtype)).result()
+                try:
+                    array[start : start + length].write(value.astype(array.dtype.numpy_dtype)).result()
+                except ValueError as error:  # as TensorStore reports a full disk, too
+                    raise FileError(f"{self.folder}: cannot be written: {str(error)[:300]}") from error
             start += length
         self._tasks.append(TaskInfo(name, split, tuple(lengths), tuple(has_action)))
 
@@ -231,8 +231,9 @@ class DataSet:
             path = self.folder / f"{task:05d}" / field
             shape, dtype = _fields(self.header)[field]
             expected = (sum(self.header.tasks[task].lengths), *shape)
-            if not path.resolve().is_relative_to(self.folder.resolve()):
-                raise ValueError(f"{path}: leads out of the data set's folder, expected a folder inside")
+            if path.parent.is_symlink() or path.is_symlink():
+                raise FileError(f"{path}: is reached through a link, expected none: links are not followed")
+            files.refuse_links(path)
             spec = {"driver": "zarr3", "kvstore": _kvstore(path), "fill_missing_data_reads": False}
             try:
                 array = ts.open(spec, open=True, read=True).result()
@@ -249,12 +250,10 @@ class DataSet:
 
 
 def check_size(field: str, shape: tuple[int, ...], itemsize: int) -> None:
-    """Raises ValueError for an array larger than MAX_BYTES, before memory is allocated for it."""
+    """Raises FileError for an array larger than MAX_BYTES, before memory is allocated for it."""
     size = itemsize * math.prod(int(n) for n in shape)
     if size > MAX_BYTES:
-        raise ValueError(
-            f"{field}: got shape {list(shape)}, {size / 2**30:.3g} GiB, expected at most {MAX_BYTES >> 30}"
-        )
+        raise FileError(f"{field}: got shape {list(shape)}, {size / 2**30:.3g} GiB, expected at most {MAX_BYTES >> 30}")
 
 
 def spread(length: int, horizon: int) -> np.ndarray:
@@ -294,22 +293,22 @@ def _create(path: pathlib.Path, shape: tuple[int, ...], dtype: Any) -> Any:
 
 
 def _write_group(folder: pathlib.Path, attributes: dict[str, Any]) -> None:
-    folder.mkdir(exist_ok=True)
-    (folder / "zarr.json").write_text(json.dumps({**_GROUP, "attributes": attributes}, indent=1) + "\n")
+    files.write_json(folder / "zarr.json", {**_GROUP, "attributes": attributes})
 
 
 def _read_header(folder: pathlib.Path) -> Header:
     path = folder / "zarr.json"
     if not path.is_file():
         raise ValueError(f"data: {folder} has no zarr.json, expected a folder written by milx.data")
+    whole = files.read_json(path)
     try:
-        values = json.loads(path.read_text())["attributes"]["milx"]
+        values = dict(whole["attributes"]["milx"])
         version = values.pop("version")
         if version != VERSION:
             raise ValueError(f"version: got {version!r}, expected {VERSION}")
         return _parse_header(values)
     except (KeyError, TypeError, AttributeError, ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: expected the header of a milx data set: {error}") from error
+        raise FileError(f"{path}: expected the header of a milx data set: {error}") from error
 
 
 def _parse_header(values: dict[str, Any]) -> Header:

@@ -1,9 +1,7 @@
 """What importers share: which episodes make a task, which tasks make a split, and writing them down."""
 
 import hashlib
-import json
 import pathlib
-import sys
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple, Protocol
 
@@ -12,6 +10,9 @@ from absl import app, flags
 from PIL import Image
 from rich.progress import track
 
+from milx.core import files
+from milx.core.files import FileError
+from milx.core.messages import fail
 from milx.data.dataset import Writer
 from milx.types import Demo
 
@@ -79,7 +80,7 @@ def run(argv: list[str], open_source: Callable[[str, Any], Source]) -> None:
         source = open_source(argv[1], FLAGS)
         write(argv[2], source.episodes(FLAGS.task), source.sizes, (FLAGS.validation, FLAGS.test), argv[1])
     except (ValueError, OSError) as error:
-        sys.exit(f"milx: {error}")
+        fail(error)
     print(f"{argv[2]}: look at it with `python -m milx.data.check {argv[2]}`")
 
 
@@ -122,7 +123,7 @@ def assign_splits(names: list[str], validation: float, test: float) -> dict[str,
         raise ValueError(f"validation + test: got {validation + test}, expected less than 1: the rest is for training")
     if (needed := 1 + (validation > 0) + (test > 0)) > len(names):
         raise ValueError(f"tasks: got {len(names)}, expected at least {needed}: one for each split")
-    shuffled = sorted(names, key=lambda name: hashlib.sha256(name.encode()).digest())
+    shuffled = sorted(names, key=lambda name: hashlib.sha256(name.encode(errors="surrogatepass")).digest())
     second = min(max(round((validation + test) * len(names)), needed - 1), len(names) - 1)
     first = min(max(round(validation * len(names)), validation > 0), second - (test > 0))
     of = lambda i: "validation" if i < first else "test" if i < second else "train"  # noqa: E731
@@ -136,8 +137,8 @@ def read_mapping(path: str | pathlib.Path) -> dict[str, str]:
         ValueError: for a file that holds something else.
     """
     try:
-        mapping = json.loads(pathlib.Path(path).read_text())
-    except (OSError, ValueError, RecursionError) as error:
+        mapping = files.read_json(pathlib.Path(path).resolve())
+    except FileError as error:
         raise ValueError(f"task: expected a JSON file at {path}: {error}") from error
     if not isinstance(mapping, dict) or not all(isinstance(task, str) for task in mapping.values()):
         raise ValueError(f"task: {path}: expected a JSON object from names of episodes to names of tasks")
@@ -148,31 +149,13 @@ def lookup(mapping: dict[str, str], name: str, path: str) -> str:
     """Looks up the task of an episode.
 
     Raises:
-        ValueError: if the mapping does not say.
+        FileError: if the mapping does not say.
     """
     if name not in mapping:
-        raise ValueError(
+        raise FileError(
             f"task: {path} does not say to which task episode {name!r} belongs, expected all episodes in it"
         )
     return mapping[name]
-
-
-def inside(root: pathlib.Path, path: str | pathlib.Path) -> pathlib.Path:
-    """Finds a file of a data set, as its metadata names it, inside the data set's folder.
-
-    Raises:
-        ValueError: if that leads out of the data set's folder, by "..", an absolute path or a link, or to no file.
-    """
-    try:
-        found = (root / path).resolve()
-        there = found.is_file()
-    except (OSError, RuntimeError, ValueError) as error:  # names that are too long, links that lead to themselves
-        raise ValueError(f"{root}: expected a path, got {str(path)[:200]}: {error!r:.200}") from error
-    if not found.is_relative_to(root.resolve()):
-        raise ValueError(f"{root}: {path} leads out of the data set's folder, expected a path inside")
-    if not there:
-        raise ValueError(f"{root}: {path} is missing, expected a file")
-    return found
 
 
 def shrunk(shape: tuple[int, ...], height: int) -> tuple[int, int]:

@@ -9,7 +9,6 @@ file (--task=file), or what a JSON file says that maps the numbers of episodes t
 
 import functools
 import io
-import json
 import pathlib
 import re
 from collections.abc import Iterator
@@ -19,6 +18,7 @@ import numpy as np
 from absl import app
 from PIL import Image
 
+from milx.core import files
 from milx.data import episodes as shared
 from milx.data.dataset import check_size
 from milx.data.episodes import Episode, Sizes
@@ -68,7 +68,7 @@ class LeRobot:
             if mapping is not None:
                 name = shared.lookup(mapping, str(number), task)
             else:
-                name = file.relative_to(self.root.resolve()).as_posix() if task == "file" else str(row["tasks"][0])
+                name = file.relative_to(self.root).as_posix() if task == "file" else str(row["tasks"][0])
             read = functools.partial(self._read, row, file)
             found.append(Episode(name, row["length"], bool(self.action), read))
         return found
@@ -105,7 +105,7 @@ class LeRobot:
         prefix = f"videos/{self.camera}"
         values = {"video_key": self.camera}
         values |= {name: row[f"{prefix}/{name}"] for name in ("chunk_index", "file_index")}
-        file = shared.inside(self.root, _fill(self.info["video_path"], values))
+        file = files.inside(self.root, _fill(self.info["video_path"], values))
         yield from read_video(file, row[f"{prefix}/from_timestamp"], row["length"], self.info["fps"])
 
     def _rows(self) -> list[dict[str, Any]]:
@@ -116,7 +116,7 @@ class LeRobot:
             columns += [f"{prefix}/chunk_index", f"{prefix}/file_index", f"{prefix}/from_timestamp"]
         rows = []
         for path in sorted((self.root / "meta" / "episodes").glob("*/*.parquet")):
-            rows += _read_table(shared.inside(self.root, path.relative_to(self.root)), tuple(columns)).to_pylist()
+            rows += _read_table(files.inside(self.root, path.relative_to(self.root)), tuple(columns)).to_pylist()
         if not rows:
             raise ValueError(f"{self.root}: meta/episodes is empty, expected episodes")
         for row in rows:
@@ -142,14 +142,14 @@ class LeRobot:
 
     def _data_file(self, row: dict[str, Any]) -> pathlib.Path:
         values = {name: row[f"data/{name}"] for name in ("chunk_index", "file_index")}
-        return shared.inside(self.root, _fill(self.info["data_path"], values))
+        return files.inside(self.root, _fill(self.info["data_path"], values))
 
     def _read_info(self) -> dict[str, Any]:
         path = self.root / "meta" / "info.json"
         if not path.is_file():
             raise ValueError(f"{self.root} has no meta/info.json, expected a LeRobot data set")
         try:
-            info = json.loads(shared.inside(self.root, "meta/info.json").read_text())
+            info = files.read_json(files.inside(self.root, "meta/info.json"))
             version = str(info["codebase_version"])
             features, fps = info["features"], info["fps"]
         except (KeyError, TypeError, ValueError, RecursionError) as error:
@@ -203,7 +203,7 @@ def read_video(file: pathlib.Path, start: float, count: int, fps: float) -> Iter
         raise ValueError("reading videos needs the package av: install milx with the extra 'lerobot'") from error
     wanted = 0
     try:
-        with av.open(str(file)) as container:
+        with av.open(str(file), format="mp4") as container:
             stream = container.streams.video[0]
             stream.thread_type = "AUTO"
             container.seek(int(start * av.time_base))
@@ -222,7 +222,7 @@ def read_video(file: pathlib.Path, start: float, count: int, fps: float) -> Iter
 def _images(file: pathlib.Path, values: list[Any]) -> Iterator[np.ndarray]:
     for value in values:
         try:
-            yield np.asarray(Image.open(io.BytesIO(value["bytes"])).convert("RGB"))
+            yield np.asarray(Image.open(io.BytesIO(value["bytes"]), formats=("PNG", "JPEG")).convert("RGB"))
         except (OSError, TypeError, KeyError, Image.DecompressionBombError) as error:
             raise ValueError(f"{file}: expected an image that can be read: {error}") from error
 

@@ -6,14 +6,18 @@ PATH is a file, or a folder of *.hdf5 files. Every file is a task (--task=file),
 belongs to, by names such as "lift/demo_0", the file without its suffix and the group.
 """
 
+import contextlib
 import functools
 import pathlib
 import re
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 from absl import app
 
+from milx.core import files
+from milx.core.files import FileError
 from milx.data import episodes as shared
 from milx.data.dataset import check_size
 from milx.data.episodes import Episode, Sizes
@@ -38,7 +42,7 @@ class Robomimic:
         root = pathlib.Path(path)
         self.files = [root]
         if root.is_dir():
-            self.files = [shared.inside(root, file.name) for file in sorted(root.glob("*.hdf5"))]
+            self.files = [files.inside(root, file.name) for file in sorted(root.glob("*.hdf5"))]
         if not self.files or not self.files[0].is_file():
             raise ValueError(f"{path}: expected a file in robomimic's layout, or a folder of *.hdf5 files")
         self.state, self.action = [name for name in state.split(",") if name], action
@@ -80,7 +84,7 @@ class Robomimic:
     def _length(self, file: Any, demo: str) -> int:
         lengths = {name: len(_dataset(file, name, axes)) for name, axes in self._names(demo).items()}
         if len(set(lengths.values())) != 1 or 0 in lengths.values():
-            raise ValueError(f"{file.filename}: data/{demo}: got lengths {lengths}, expected one that is at least 1")
+            raise FileError(f"{file.filename}: data/{demo}: got lengths {lengths}, expected one that is at least 1")
         return next(iter(lengths.values()))
 
     def _read(self, path: pathlib.Path, demo: str) -> Demo:
@@ -93,33 +97,38 @@ class Robomimic:
                 frames = _dataset(file, f"{lead}/obs/{self.camera}", 4)
                 if frames.dtype != np.uint8 or frames.shape[-1] != 3:
                     got = f"{frames.dtype} {list(frames.shape)}"
-                    raise ValueError(f"{path}: {frames.name}: got {got}, expected uint8 [T, H, W, 3]")
+                    raise FileError(f"{path}: {frames.name}: got {got}, expected uint8 [T, H, W, 3]")
                 image = np.stack(list(shared.resized(iter(frames), self.sizes.image_shape)))
             return Demo(image, np.concatenate(states, axis=1) if states else None, action)
 
     def _only_camera(self, file: Any, demo: str) -> str:
         cameras = [name for name in _members(file, f"data/{demo}/obs") if name.endswith("_image")]
         if len(cameras) > 1:
-            raise ValueError(f"camera: expected one of {', '.join(cameras)}, or none with --camera=")
+            raise FileError(f"camera: expected one of {', '.join(cameras)}, or none with --camera=")
         return cameras[0] if cameras else ""
 
 
-def _open(path: pathlib.Path) -> Any:
+@contextlib.contextmanager
+def _open(path: pathlib.Path) -> Iterator[Any]:
+    """Opens a file; whatever fails while it is open is a FileError that names it."""
     try:
         import h5py
     except ImportError as error:
         raise ValueError("reading robomimic's files needs h5py: install milx with the extra 'robomimic'") from error
     try:
-        return h5py.File(path, "r")
-    except OSError as error:
-        raise ValueError(f"{path}: expected an HDF5 file that can be read: {error}") from error
+        with h5py.File(path, "r") as file:
+            yield file
+    except FileError:
+        raise
+    except Exception as error:  # on damaged bytes h5py raises nearly all types of errors
+        raise FileError(f"{path}: expected an HDF5 file that can be read: {error!r:.300}") from error
 
 
 def _demos(file: Any) -> list[str]:
     """Lists the names of the demonstrations, demo_2 before demo_10."""
     names = _members(file, "data")
     if not names:
-        raise ValueError(f"{file.filename}: expected demonstrations under data/, there are none")
+        raise FileError(f"{file.filename}: expected demonstrations under data/, there are none")
     number = lambda name: int((re.findall(r"\d+", name) or ["0"])[-1])  # noqa: E731
     return sorted(names, key=lambda name: (number(name), name))
 
@@ -132,13 +141,13 @@ def _dataset(file: Any, name: str, axes: int) -> Any:
     where, found = f"{file.filename}: {name}", file.get(name)
     if not isinstance(found, h5py.Dataset):
         there = ", ".join(_members(file, name.rpartition("/")[0])) or "nothing"
-        raise ValueError(f"{where}: missing, expected it beside {there}")
+        raise FileError(f"{where}: missing, expected it beside {there}")
     if found.is_virtual or found.external:
-        raise ValueError(f"{where}: is stored outside the file, expected inside: nothing else is read")
+        raise FileError(f"{where}: is stored outside the file, expected inside: nothing else is read")
     if found.ndim != axes or found.dtype.kind not in "fiu":
-        raise ValueError(f"{where}: got {found.dtype} {list(found.shape)}, expected numbers with {axes} axes")
+        raise FileError(f"{where}: got {found.dtype} {list(found.shape)}, expected numbers with {axes} axes")
     if 0 in found.shape[1:]:
-        raise ValueError(f"{where}: got shape {list(found.shape)}, expected something in every row")
+        raise FileError(f"{where}: got shape {list(found.shape)}, expected something in every row")
     check_size(where, found.shape, found.dtype.itemsize)
     return found
 
@@ -160,7 +169,7 @@ def _check_links(file: Any, name: str) -> None:
     for part in name.split("/"):
         link = at.get(part, getlink=True) if isinstance(at, h5py.Group) else None
         if isinstance(link, h5py.ExternalLink | h5py.SoftLink):
-            raise ValueError(
+            raise FileError(
                 f"{file.filename}: {name}: {part} is a link out of its group, expected none: it is not followed"
             )
         at = None if link is None else at.get(part)

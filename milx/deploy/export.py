@@ -2,13 +2,11 @@
 
 adapt.bin, act.bin      the programs, serialized by `jax.export`; they need neither milx nor Flax nor MuJoCo
 params.npz              the learned parameters with the whitening, and the memory at the start of an episode
-policy.json             the shapes of the programs' inputs
+policy.json             the shapes of the programs' inputs, and the SHA-256 of the other files
 policy.py               a copy of `milx/deploy/standalone.py`, which loads the other files
 """
 
-import json
 import pathlib
-import shutil
 from typing import Any
 
 import jax
@@ -18,6 +16,7 @@ from jax import export as jax_export
 
 from milx import envs
 from milx.config.schema import GIVEN
+from milx.core import files
 from milx.data.goals import with_goals
 from milx.deploy import standalone
 from milx.deploy.policy import Policy
@@ -35,7 +34,7 @@ def export(policy: Policy, out: str | pathlib.Path, shots: int = 1) -> None:
         shots: K, the number of demonstrations that `adapt` takes.
 
     Raises:
-        ValueError: if the folder exists.
+        ValueError: if the folder exists or cannot be written.
     """
     folder = pathlib.Path(out)
     if folder.exists():
@@ -73,17 +72,15 @@ def export(policy: Policy, out: str | pathlib.Path, shots: int = 1) -> None:
         "adapt": _program(adapt, leaves, shapes["adapt"]),
         "act": _program(act, jax.tree.leaves(task_params), shapes["act"], memory),
     }
-    partial = folder.with_name(f"{folder.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir(parents=True)
-    for name, program in programs.items():
-        (partial / f"{name}.bin").write_bytes(program)
-    arrays: dict[str, Any] = {f"{i:04d}": np.asarray(leaf) for i, leaf in enumerate(leaves)}
+    arrays = {f"{i:04d}": np.asarray(leaf) for i, leaf in enumerate(leaves)}
     arrays |= {f"memory{i:04d}": np.asarray(leaf) for i, leaf in enumerate(memory)}
-    np.savez(partial / "params.npz", **arrays)
-    (partial / "policy.json").write_text(json.dumps(sizes, indent=1) + "\n")
-    shutil.copyfile(standalone.__file__, partial / "policy.py")
-    partial.rename(folder)
+    with files.creating(folder) as partial:
+        for name, program in programs.items():
+            files.write_bytes(partial / f"{name}.bin", program)
+        files.write_arrays(partial / "params.npz", arrays, compress=False)
+        digests = {path.name: files.sha256(path) for path in sorted(partial.iterdir())}
+        files.write_json(partial / "policy.json", {"format": standalone.FORMAT, "inputs": sizes, "sha256": digests})
+        files.write_bytes(partial / "policy.py", pathlib.Path(standalone.__file__).read_bytes())
 
 
 def input_shapes(policy: Policy, shots: int) -> dict[str, dict[str, list[int]]]:

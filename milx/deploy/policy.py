@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import json
 import pathlib
 from typing import Any
 
@@ -11,11 +10,14 @@ import numpy as np
 
 from milx import envs, methods
 from milx.config import assemble
+from milx.config.registry import load_plugins
 from milx.config.schema import GIVEN, Config
+from milx.core import files
 from milx.core.checkpoint import Checkpoints
+from milx.core.files import FileError
 from milx.data.goals import with_goals
 from milx.methods import Method
-from milx.types import SPEC_FILE, Demo, Memory, Observation, Params, Spec, TaskParams
+from milx.types import SPEC_FILE, Array, Demo, Memory, Observation, Params, Spec, TaskParams
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -41,6 +43,8 @@ class Policy:
     def adapt(self, params: Params, demo: Demo) -> TaskParams:
         """Adapts to a task from one demonstration [T, ...] or several [K, T, ...]; the computation is jitted.
 
+        Inside `jax.jit`, `jax.vmap` and `jax.grad` it is a pure function, and values are not checked.
+
         Args:
             params: `policy.params`.
             demo: images [..., T, H, W, 3] uint8 (None for a policy that sees no pixels), states [..., T, S] and actions
@@ -58,9 +62,12 @@ class Policy:
     def act(self, task_params: TaskParams, observation: Observation) -> jax.Array:
         """Returns the action [A], in the environment's units, for one observation; the computation is jitted.
 
+        Inside `jax.jit`, `jax.vmap` and `jax.grad` it is a pure function, and values are not checked.
+
         Raises:
             ValueError: for a field that is missing or has a wrong shape or type, an image for a policy that sees no
-                pixels, or a value that is not finite. Also if the policy has a memory, which needs `step`.
+                pixels, or a value that is not finite, be it in the observation or in the action. Also if the policy has
+                a memory, which needs `step`.
         """
         if jax.tree.leaves(self.initial_memory):
             raise ValueError("memory: missing, expected `Policy.step`: this policy remembers what it saw first")
@@ -80,9 +87,20 @@ class Policy:
 
         Raises:
             ValueError: for a field that is missing or has a wrong shape or type, an image for a policy that sees no
-                pixels, or a value that is not finite.
+                pixels, or a value that is not finite, be it in the observation or in the action.
         """
-        return self._step(task_params, check_observation(observation, self.spec), memory)
+        action, memory = self._step(task_params, check_observation(observation, self.spec), memory)
+        if not isinstance(action, jax.core.Tracer) and not np.isfinite(np.asarray(action)).all():
+            raise ValueError(
+                f"action: got {action}, expected finite numbers: the observation, or what was learned of the "
+                "task, is beyond what the policy can compute with"
+            )
+        return action, memory
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickles configuration, sizes and parameters; whoever loads them compiles the programs anew."""
+        params = jax.tree.map(np.asarray, self.params)
+        return _from_values, (assemble.to_dict(self.config), self.spec.to_dict(), params)
 
     @functools.cached_property
     def initial_memory(self) -> Memory:
@@ -96,6 +114,25 @@ class Policy:
     @functools.cached_property
     def _step(self) -> Any:
         return jax.jit(self.method.act)
+
+
+def _from_values(config: dict[str, Any], spec: dict[str, Any], params: Params) -> Policy:
+    load_plugins()  # it may be a policy of another package's method
+    settings, sizes = assemble.from_dict(config), Spec.from_dict(spec)
+    return Policy(methods.make(settings, sizes), sizes, jax.tree.map(jax.numpy.asarray, params), settings)
+
+
+def read_spec(path: pathlib.Path) -> Spec:
+    """Reads the sizes of a policy in a JSON file.
+
+    Raises:
+        FileError: if the file cannot be read, or holds something else.
+    """
+    values = files.read_json(path)
+    try:
+        return Spec.from_dict(values)
+    except (ValueError, RecursionError) as error:
+        raise FileError(f"{path}: expected the sizes of a policy: {error}") from error
 
 
 def load_run(run: str | pathlib.Path) -> Policy:
@@ -113,10 +150,7 @@ def load_run(run: str | pathlib.Path) -> Policy:
         raise ValueError(f"run: {folder} has no config.json, expected a folder written by `python -m milx.train`")
     config = assemble.read(path)
     if (folder / SPEC_FILE).is_file():
-        try:
-            spec = Spec.from_dict(json.loads((folder / SPEC_FILE).read_text()))
-        except (ValueError, TypeError, AttributeError, RecursionError) as error:
-            raise ValueError(f"{folder / SPEC_FILE}: expected the sizes of a policy: {error}") from error
+        spec = read_spec(folder / SPEC_FILE)
     else:
         spec = envs.make(config.env_name, config.env.image_shape, config.env.action_cost).spec
     method = methods.make(config, spec)
@@ -164,9 +198,9 @@ def check_demo(demo: Demo, spec: Spec, given: str = GIVEN[0]) -> Demo:
     return with_goals(checked, spec.goal_indices, spec.height_index)
 
 
-def _check_action(value: Any, shape: tuple[int, ...], spec: Spec) -> np.ndarray:
+def _check_action(value: Any, shape: tuple[int, ...], spec: Spec) -> Array:
     action = _check_vector("demo.action", value, (*shape, spec.action_size))
-    if spec.action_range is None:
+    if spec.action_range is None or isinstance(action, jax.core.Tracer):
         return action
     low, high = spec.action_range
     if outside := np.argwhere((action < low) | (action > high)).tolist():
@@ -210,17 +244,19 @@ def _check_image(field: str, value: Any, lead: tuple[int, ...], spec: Spec) -> j
     return array
 
 
-def _check_state(field: str, value: Any, lead: tuple[int, ...], spec: Spec) -> np.ndarray:
+def _check_state(field: str, value: Any, lead: tuple[int, ...], spec: Spec) -> Array:
     """Checks states; None is allowed if the policy uses no states, and becomes an empty array."""
     if value is None and not spec.state_size:
         return np.zeros((*lead, 0), np.float32)
     return _check_vector(field, value, (*lead, spec.state_size))
 
 
-def _check_vector(field: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
+def _check_vector(field: str, value: Any, shape: tuple[int, ...]) -> Array:
     array = _check_shape(field, value, shape)
     if array.dtype.kind not in "fiu":
         raise ValueError(f"{field}: got {array.dtype}, expected real numbers")
+    if isinstance(array, jax.core.Tracer):  # its values are not known yet
+        return array.astype(np.float32)
     array = np.asarray(array, np.float32)
     if not np.isfinite(array).all():
         index = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])

@@ -1,13 +1,13 @@
 """Policies that ship with milx: `milx.load("push")`."""
 
-import json
 import pathlib
+import sys
 from typing import Any
 
 from milx import envs, methods
 from milx.config import assemble
 from milx.config.registry import load_plugins
-from milx.core import pytrees
+from milx.core import files, pytrees
 from milx.deploy import policy
 from milx.deploy.policy import Policy
 from milx.methods import params_like
@@ -22,29 +22,37 @@ def names() -> list[str]:
 
 def result(name: str) -> dict[str, Any]:
     """Reads a policy's result: its run's evaluation.json, and `pytrees.fingerprint` of its parameters."""
-    return json.loads((FOLDER / name / "result.json").read_text())
+    return files.read_json(FOLDER / name / "result.json")
 
 
 def load(run: str | pathlib.Path) -> Policy:
     """Loads the best policy of a run, or one that ships with milx.
 
     Args:
-        run: the run's folder, as `python -m milx.train` writes it, or the name of a policy that ships with milx.
+        run: the run's folder, as `python -m milx.train` writes it, or the name of a policy that ships with milx. A
+            folder of that name comes first, which is reported.
 
     Raises:
-        ValueError: if it is neither, or if the run has no checkpoint yet.
+        ValueError: if it is neither, if the run has no checkpoint yet, or if the files have been changed.
     """
     load_plugins()  # a run may be of another package's method or environment
     is_run = (pathlib.Path(run) / "config.json").is_file()
+    if is_run and run in names():
+        print(f"milx: loading the run in ./{run}, not the policy {run!r} that ships with milx", file=sys.stderr)
     if is_run or (pathlib.Path(run).exists() and run not in names()):
         return policy.load_run(run)
     if run not in names():
         expected = f"the folder of a run, or one of {', '.join(names())}, which ship with milx"
         raise ValueError(f"run: got {str(run)!r}, expected {expected}")
-    config = assemble.from_dict(result(str(run))["config"])
+    reached = result(str(run))
+    config = assemble.from_dict(reached["config"])
     spec = envs.make(config.env_name, config.env.image_shape, config.env.action_cost).spec
     method = methods.make(config, spec)
     params = pytrees.read(FOLDER / run / "params.npz", like=params_like(method, spec))
+    if pytrees.fingerprint(params) != reached["params_hash"]:
+        raise files.FileError(
+            f"{FOLDER / run / 'params.npz'}: has changed, expected the parameters that ship with milx"
+        )
     return Policy(method, spec, params, config)
 
 
@@ -58,4 +66,4 @@ def save(trained: Policy, reached: dict[str, Any], folder: pathlib.Path) -> None
     """
     pytrees.write(folder / "params.npz", trained.params)
     digest = pytrees.fingerprint(trained.params)
-    (folder / "result.json").write_text(json.dumps(reached | {"params_hash": digest}, indent=1) + "\n")
+    files.write_json(folder / "result.json", reached | {"params_hash": digest})

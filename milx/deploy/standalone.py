@@ -8,6 +8,8 @@ while True:
     action = policy.act(task_params, image=camera(), state=robot())  # [A]
 """
 
+import hashlib
+import io
 import json
 import os
 import pathlib
@@ -16,6 +18,9 @@ import jax
 import jax.export
 import jax.numpy as jnp
 import numpy as np
+
+FORMAT = 1
+"""The number of the layout of policy.json."""
 
 
 class Policy:
@@ -28,20 +33,22 @@ class Policy:
         sizes: the shapes of the inputs, by field: [K, T, ...] for "adapt" and [...] for "act".
         params: the learned parameters.
         initial_memory: the memory at the start of an episode; empty for most policies.
+
+    Raises:
+        ValueError: if a file is missing or not the one that was exported.
     """
 
     def __init__(self, folder: str | os.PathLike):
         folder = pathlib.Path(folder)
-        self.sizes = json.loads((folder / "policy.json").read_text())
-        with np.load(folder / "params.npz", allow_pickle=False) as arrays:
+        self.sizes, digests = _read_header(folder / "policy.json")
+        names = ("params.npz", "adapt.bin", "act.bin")
+        params, *programs = (_read(folder / name, digests.get(name)) for name in names)
+        with np.load(io.BytesIO(params), allow_pickle=False) as arrays:
             self.params, self.initial_memory = (
                 [jnp.asarray(arrays[name]) for name in sorted(arrays) if name.startswith("memory") == of_memory]
                 for of_memory in (False, True)
             )
-        self._adapt, self._act = (
-            jax.jit(jax.export.deserialize(bytearray((folder / f"{name}.bin").read_bytes())).call)
-            for name in ("adapt", "act")
-        )
+        self._adapt, self._act = (jax.jit(jax.export.deserialize(bytearray(program)).call) for program in programs)
 
     def adapt(self, **demo: np.ndarray) -> list[jax.Array]:
         """Adapts to a task from one demonstration, or from several of the same length.
@@ -80,7 +87,7 @@ class Policy:
 
         Raises:
             ValueError: for a field that is missing, not expected, or has a wrong shape or type, or a value that is not
-                finite. Also if the policy has a memory, which needs `step`.
+                finite, also in the action. Also if the policy has a memory, which needs `step`.
         """
         if self.initial_memory:
             raise ValueError("memory: missing, expected `step`: this policy remembers what it saw first")
@@ -99,9 +106,15 @@ class Policy:
 
         Raises:
             ValueError: for a field that is missing, not expected, or has a wrong shape or type, or a value that is not
-                finite.
+                finite, also in the action.
         """
-        return self._act(task_params, self._checked(observation, self.sizes["act"], lead=0), memory)
+        action, memory = self._act(task_params, self._checked(observation, self.sizes["act"], lead=0), memory)
+        if not np.isfinite(np.asarray(action)).all():
+            raise ValueError(
+                f"action: got {action}, expected finite numbers: the observation, or what was learned of the "
+                "task, is beyond what the policy can compute with"
+            )
+        return action, memory
 
     @staticmethod
     def _checked(values: dict, wanted: dict, lead: int) -> dict[str, np.ndarray]:
@@ -121,3 +134,32 @@ class Policy:
                 raise ValueError(f"{name}: got values that are not finite")
             checked[name] = value if name == "image" else value.astype(np.float32)
         return checked
+
+
+def _read_header(path: pathlib.Path) -> tuple[dict, dict]:
+    """Reads the shapes of the inputs, and the SHA-256 of the other files by name."""
+    try:
+        values = json.loads(_content(path))
+        if values["format"] != FORMAT:
+            raise ValueError(f"format: got {values['format']!r}, expected {FORMAT}")
+        inputs, digests = values["inputs"], values["sha256"]
+        if not isinstance(inputs, dict) or not isinstance(digests, dict):
+            raise ValueError("inputs and sha256: expected objects")
+        return inputs, digests
+    except (KeyError, TypeError, ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: expected what the export of a policy writes: {error!r:.200}") from error
+
+
+def _read(path: pathlib.Path, digest: str | None) -> bytes:
+    """Reads a file that must have this SHA-256."""
+    content = _content(path)
+    if hashlib.sha256(content).hexdigest() != digest:
+        raise ValueError(f"{path}: has changed since the export, expected the file that was written then")
+    return content
+
+
+def _content(path: pathlib.Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read: {error.strerror}") from error

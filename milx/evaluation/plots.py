@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 import imageio.v3 as iio
 import numpy as np
 
+from milx.core import files
 from milx.evaluation import listening
 
 if TYPE_CHECKING:  # importing matplotlib takes half a second, which no run should wait for before its first line
@@ -47,7 +48,12 @@ def learning_curve(metrics: list[dict[str, Any]], evaluation: dict[str, Any], pa
         right.axhline(value, color=color, ls="--", lw=1, label=name.replace("_", "-"))
     right.set(xlabel="meta-updates", ylabel="success", ylim=(0, 1.02))
     right.legend(fontsize=8)
-    figure.savefig(path, dpi=120)
+    _save(figure, path)
+
+
+def _save(figure: "Figure", path: pathlib.Path) -> None:
+    with files.replacing(path) as partial:
+        figure.savefig(partial, dpi=120, format="png")
 
 
 def _figure(width: float) -> "Figure":
@@ -93,7 +99,7 @@ def action_errors(metrics: list[dict[str, Any]], evaluation: dict[str, Any], pat
     bars = right.bar([name.replace("_", "\n") for name in names], [errors[name] for name in names], color="0.7")
     bars[-1].set_color("tab:blue")
     right.set(title=f"test, {errors['tasks']} tasks", ylabel="squared error of the actions")
-    figure.savefig(path, dpi=120)
+    _save(figure, path)
 
 
 def side_by_side(demo: np.ndarray, trial: np.ndarray, path: pathlib.Path, fps: int = 20) -> None:
@@ -109,4 +115,5 @@ def side_by_side(demo: np.ndarray, trial: np.ndarray, path: pathlib.Path, fps: i
     clips = [np.concatenate([left, gap, right], axis=2) for left, right in zip(demo, trial, strict=True)]
     # The last frame stays for half a second before the next task begins.
     frames = np.concatenate([np.concatenate([clip, np.repeat(clip[-1:], fps // 2, axis=0)]) for clip in clips])
-    iio.imwrite(path, frames, extension=".gif", duration=1000 / fps, loop=0)
+    with files.replacing(path) as partial:
+        iio.imwrite(partial, frames, extension=".gif", duration=1000 / fps, loop=0)

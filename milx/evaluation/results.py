@@ -1,8 +1,5 @@
 """Result files: one JSON object for a run or a cell, with the same fields in all experiments."""
 
-import json
-import os
-import pathlib
 from typing import Any
 
 from milx.config import assemble
@@ -44,10 +41,3 @@ def intervals(runs: list[dict[str, Any]]) -> list[tuple[float, float]]:
     """
     kind = "bootstrap95" if all("bootstrap95" in run for run in runs) else "wilson95"
     return [(run[kind][0], run[kind][1]) for run in runs]
-
-
-def write_json(path: pathlib.Path, values: dict[str, Any]) -> None:
-    """Writes a file as a whole: a process that is killed leaves the old one or the new one."""
-    partial = path.with_suffix(f".partial{os.getpid()}")
-    partial.write_text(json.dumps(values, indent=1) + "\n")
-    partial.replace(path)

@@ -11,6 +11,7 @@ import jax
 import numpy as np
 
 from milx.config.schema import ConvConfig
+from milx.core import files
 from milx.types import Params
 
 KMEANS = "kmeans"
@@ -63,11 +64,10 @@ def read_filters(path: str, config: ConvConfig) -> Filters:
 def _read(file: pathlib.Path) -> dict[str, np.ndarray]:
     try:
         if file.suffix == ".npz":
-            with np.load(file, allow_pickle=False) as arrays:
-                return dict(arrays)
-        from safetensors.numpy import load_file
+            return files.read_arrays(file.resolve())
+        from safetensors.numpy import load
 
-        return load_file(file)
+        return load(files.read_bytes(file.resolve()))
     except ImportError as error:
         raise ValueError(f"network.fixed_filters: {file} needs the package safetensors; pip install it") from error
     except Exception as error:  # safetensors and zipfile raise many types

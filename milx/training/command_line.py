@@ -4,7 +4,6 @@ import functools
 import gc
 import os
 import pathlib
-import sys
 from collections.abc import Callable, Sequence
 
 import jax
@@ -15,6 +14,7 @@ from milx.config import assemble
 from milx.config.registry import DURATIONS, PRESETS, load_plugins
 from milx.config.schema import Config
 from milx.core import parallel, platform
+from milx.core.messages import fail
 from milx.data import RECORDED
 from milx.envs import ENVS
 from milx.methods import METHODS
@@ -61,7 +61,7 @@ def run(main: Callable[[Config, str], None]) -> None:
         try:
             return parse(argv)
         except flags.Error as error:
-            sys.exit(f"milx: {error}")
+            fail(error)
 
     def start(argv: Sequence[str]) -> None:
         logging.set_verbosity(logging.ERROR)  # Orbax warns of things that milx does on purpose
@@ -76,7 +76,7 @@ def run(main: Callable[[Config, str], None]) -> None:
             with signals.Stop().listen():
                 main(config, workdir)
         except (ValueError, OSError) as error:
-            sys.exit(f"milx: {error}")
+            fail(error)
 
     app.run(start, flags_parser=parse_or_exit)
 
@@ -108,17 +108,17 @@ def parse(argv: Sequence[str], values: flags.FlagValues = FLAGS) -> list[str]:
     hosts = values.coordinator, values.num_processes, values.process_id
     if None in hosts and hosts != (None, None, None):
         raise flags.Error("--coordinator, --num_processes and --process_id: got some of them, expected all or none")
-    parallel.join_hosts(*hosts)
-    load_plugins()
-    preset = values.preset or ("cpu" if jax.default_backend() == "cpu" else "fast")
     try:
+        parallel.join_hosts(*hosts)
+        load_plugins()
+        preset = values.preset or ("cpu" if jax.default_backend() == "cpu" else "fast")
         if values.data is None and values.env == RECORDED:
             raise flags.Error(f"--env: got {RECORDED!r}, expected --data=FOLDER, the folder of the demonstrations")
         if values.data is None:
             config = assemble.make_config(values.env, values.method, preset, values.seed)
         else:
             config = recorded.config_for(values.data, values.method, preset, values.seed)
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, RuntimeError) as error:  # the last if JAX finds no device
         raise flags.Error(str(error)) from error
     _check_fields(argv, config)
     unset = [arg for arg in argv if arg.startswith("--config.") and arg.endswith("=None")]

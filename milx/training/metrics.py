@@ -3,51 +3,72 @@
 import contextlib
 import json
 import pathlib
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 from typing import Any
 
-from tensorboardX import SummaryWriter
+from tensorboardX import summary
+from tensorboardX.event_file_writer import EventsWriter
+from tensorboardX.proto.event_pb2 import Event, SessionLog
+
+from milx.core import files
+from milx.core.files import FileError
 
 
 class MetricsWriter:
     """Writes numbers to metrics.jsonl and to TensorBoard events.
 
+    Both are written before `write` returns, without threads or queues. What cannot be written, for example on a full
+    disk, is reported and left out; TensorBoard's file, once it has failed, is not written any more.
+
     Args:
         folder: the run's.
         step: where the run continues; lines after it are from before an interruption and are dropped.
-        warn: told of a line that cannot be written, say on a full disk, and is left out.
+        warn: told of what cannot be written.
     """
 
     def __init__(self, folder: pathlib.Path, step: int, warn: Callable[[str], None]):
-        self._warn = warn
-        path = folder / "metrics.jsonl"
-        lines = [line for line in read_metrics(path) if line["step"] <= step] if path.is_file() else []
-        partial = path.with_suffix(".partial")
-        partial.write_text("".join(json.dumps(line) + "\n" for line in lines))
-        partial.replace(path)
-        self._file = path.open("a", buffering=1)
-        self._events = SummaryWriter(str(folder), purge_step=step + 1)
+        self._warn, self._path = warn, folder / "metrics.jsonl"
+        self._events: EventsWriter | None = None
+        lines = [line for line in read_metrics(self._path) if line["step"] <= step] if self._path.is_file() else []
+        with self._reported("metrics"):
+            files.write_bytes(self._path, "".join(json.dumps(line) + "\n" for line in lines).encode())
+        with self._reported("TensorBoard's events"):
+            self._events = EventsWriter(str(folder / "events"), f".{step}")
+            # TensorBoard drops what an interrupted run wrote from this step on.
+            self._events.write_event(Event(step=step + 1, session_log=SessionLog(status=SessionLog.START)))
 
     def write(self, step: int, values: dict[str, float]) -> None:
         """Writes one line."""
-        try:
-            self._file.write(json.dumps({"step": step, **values}) + "\n")
-        except OSError as error:
-            self._warn(f"metrics of step {step} could not be written: {error}")
-        for name, value in values.items():
-            self._events.add_scalar(name, value, step)
+        with self._reported(f"metrics of step {step}"):
+            files.append(self._path, json.dumps({"step": step, **values}) + "\n")
+        if self._events is None:
+            return
+        events, self._events = self._events, None  # unless all goes well
+        with self._reported("TensorBoard's events"):
+            for name, value in values.items():
+                events.write_event(Event(step=step, wall_time=time.time(), summary=summary.scalar(name, value)))
+            events.flush()
+            self._events = events
 
     def close(self) -> None:
-        """Flushes and closes both."""
-        for file in (self._file, self._events):
-            with contextlib.suppress(OSError):  # was reported when it was written
-                file.close()
+        """Closes TensorBoard's file."""
+        if self._events is not None:
+            with self._reported("TensorBoard's events"):
+                self._events.close()
+
+    @contextlib.contextmanager
+    def _reported(self, what: str) -> Iterator[None]:
+        try:
+            yield
+        except (FileError, OSError) as error:
+            self._warn(f"{what} could not be written: {error}")
 
 
 def read_metrics(path: pathlib.Path) -> list[dict[str, Any]]:
     """Reads the lines of a metrics.jsonl file that are whole: a kill or a full disk may have left half a line."""
     lines = []
-    for line in path.read_text().splitlines():
-        with contextlib.suppress(ValueError):
+    for line in files.read_bytes(path).splitlines():
+        with contextlib.suppress(ValueError, RecursionError):
             lines.append(json.loads(line))
     return [line for line in lines if isinstance(line, dict) and "step" in line]

@@ -17,11 +17,13 @@ from rich.console import Console
 from milx.config import assemble
 from milx.config.check import check_config
 from milx.config.schema import GIVEN, Config, ConvConfig
+from milx.core import files
 from milx.data import RECORDED
 from milx.data.dataset import DataSet, spread
 from milx.data.goals import with_goals
 from milx.data.recorded import MOST_DEMOS, Recorded, Shards, read_demos, sample_batch
-from milx.evaluation import plots, results
+from milx.deploy.policy import read_spec
+from milx.evaluation import plots
 from milx.evaluation.open_loop import task_errors
 from milx.methods import whitening
 from milx.training.metrics import read_metrics
@@ -52,6 +54,14 @@ def spec_of(data: DataSet, config: Config) -> Spec:
     return Spec(head.image_shape, head.state_size, head.action_size, None, tuple(config.recorded.goal_indices))
 
 
+LARGEST = 1e12
+"""The largest state or action whose squares can be summed in float32."""
+
+
+MIN_ERROR = 1e-9
+"""An error of the mean action, in squared standard deviations, below which nothing is to be learned."""
+
+
 class Statistics(NamedTuple):
     """States [F, S] of all time steps of some tasks, and actions [F', A] of those that show them."""
 
@@ -71,7 +81,7 @@ def read_vectors(data: DataSet, tasks: list[int], horizon: int) -> Statistics:
         The states of all demonstrations, and the actions of those that show them.
 
     Raises:
-        ValueError: if a state or an action is not finite; the message names the demonstration.
+        ValueError: if a state or an action is not finite or beyond LARGEST; the message names the demonstration.
     """
     states, actions = [], []
     for task in tasks:
@@ -79,9 +89,12 @@ def read_vectors(data: DataSet, tasks: list[int], horizon: int) -> Statistics:
         for number, length in enumerate(info.lengths):
             demo = data.read(task, number, spread(length, horizon), fields=("state", "action"))
             for field, value in (("state", demo.state), ("action", demo.action)):
-                if value is not None and not np.isfinite(value).all():
+                if value is not None and not (np.abs(value) <= LARGEST).all():
                     where = f"demonstration {number} of task {task} ({info.name!r})"
-                    raise ValueError(f"data: {field} of {where}: got values that are not finite, expected finite ones")
+                    expected = f"finite ones of at most {LARGEST:.0e}"
+                    raise ValueError(
+                        f"data: {field} of {where}: got values that are not finite or too large, expected {expected}"
+                    )
             states.append(np.zeros((horizon, 0), np.float32) if demo.state is None else demo.state)
             if demo.action is not None:
                 actions.append(demo.action)
@@ -132,7 +145,11 @@ class RecordedRun(Run):
 
         spec = spec_of(self.data, config)
         super().__init__(config, spec, sample, workdir, console)
-        results.write_json(self.folder / SPEC_FILE, spec.to_dict())
+        path = self.folder / SPEC_FILE
+        if not path.is_file():
+            files.write_json(path, spec.to_dict())
+        elif (trained := read_spec(path)) != spec:
+            raise ValueError(f"data: {config.recorded.path} has {spec}, expected {trained}, as when the run began")
 
     def _enough(self, task: int, shots: int) -> bool:
         info = self.data.header.tasks[task]
@@ -165,7 +182,7 @@ class RecordedRun(Run):
     def _validate(self, params: Params) -> tuple[float, dict[str, float]]:
         errors = self._errors(params, "validation")
         names = {"own_demo": "after", "other_demo": "other_task", "no_demo": "before"}
-        heard = {name: errors[key] / errors["mean_action"] for name, key in names.items() if key in errors}
+        heard = {name: _relative(errors, key) for name, key in names.items() if key in errors}
         return 1 - heard["own_demo"], heard
 
     def _judge(self, params: Params) -> tuple[dict[str, Any], Callable[[dict[str, Any]], None]]:
@@ -177,7 +194,7 @@ class RecordedRun(Run):
             "num_demos_train": sum(len(self.data.header.tasks[i].lengths) for i in training),
             "shots": self.config.evaluation.shots,
             "given": self.config.method.given,
-            "score": 1 - errors["after"] / errors["mean_action"],
+            "score": 1 - _relative(errors, "after"),
             "criterion": "squared error of the actions of held-out tasks' other demonstrations, in standard deviations",
             "action_error": errors,
         }
@@ -235,3 +252,8 @@ class RecordedRun(Run):
         rest = lambda x: np.pad(x[shots:], [(0, fill)] + [(0, 0)] * (x.ndim - 1))  # noqa: E731
         queries = Recorded(recorded.number, *jax.tree.map(rest, (recorded.demo, recorded.there, recorded.acts)))
         return queries, with_goals(support, tuple(self.config.recorded.goal_indices), None)
+
+
+def _relative(errors: dict[str, float], name: str) -> float:
+    """Divides an error by that of the mean action, which is zero if all actions of the held-out tasks are the same."""
+    return errors[name] / max(errors["mean_action"], MIN_ERROR)

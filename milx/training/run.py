@@ -24,14 +24,15 @@ from rich.console import Console
 from milx import methods
 from milx.config import assemble
 from milx.config.schema import Config, ConvConfig
-from milx.core import parallel, progress
+from milx.core import files, parallel, progress
 from milx.core.checkpoint import UNVALIDATED, Checkpoints
+from milx.core.messages import printable
 from milx.evaluation import listening, results
 from milx.methods import params_like
 from milx.networks import fixed_filters
 from milx.training import loop, signals
 from milx.training.metrics import MetricsWriter
-from milx.training.state import Training, check_steps, initial_state, restore_state, save_state
+from milx.training.state import Training, check_steps, initial_state, parse_extra, restore_state, save_state
 from milx.training.update import Sample, Trainer, TrainState, compile_in_background, make_optimizer
 from milx.types import Params, Spec
 
@@ -120,11 +121,8 @@ class Run(abc.ABC):
             SystemExit: after a signal, with 128 plus its number.
         """
         stop = signals.Stop()
-        with signals.one_trainer(self.folder), stop.listen():
+        with files.locked(self.folder / "lock"), stop.listen():
             self._claim_folder()  # another process may have written its own configuration before this one had the lock
-            for leftover in self.folder.glob("*.partial*"):
-                if leftover.is_file():
-                    leftover.unlink()
             self._train(stop)
 
     def _train(self, stop: signals.Stop) -> None:
@@ -179,7 +177,7 @@ class Run(abc.ABC):
         return loop.Hooks(log, validate, save)
 
     def _warn(self, message: str) -> None:
-        self.console.print(f"[yellow]milx: {rich.markup.escape(message)}[/yellow]")
+        self.console.print(f"[yellow]milx: {rich.markup.escape(printable(message))}[/yellow]")
 
     def evaluate(self) -> dict[str, Any]:
         """Evaluates the best checkpoint on the test tasks; writes and returns evaluation.json, and draws it.
@@ -193,10 +191,10 @@ class Run(abc.ABC):
             raise ValueError(f"workdir: {self.folder} has no checkpoint yet; train first")
         items, _ = checkpoints.restore(step, {"params": self._params_like})
         _, extra = checkpoints.restore(checkpoints.latest, {})
-        self.clock.seconds = extra["seconds"]
+        dataset_hash, self.clock.seconds = parse_extra(checkpoints, checkpoints.latest, extra)
         found, draw = self._judge(items["params"])
-        result = results.compose(self.config, found, self.clock.elapsed(), step, extra["dataset_hash"])
-        results.write_json(self.folder / "evaluation.json", result)
+        result = results.compose(self.config, found, self.clock.elapsed(), step, dataset_hash)
+        files.write_json(self.folder / "evaluation.json", result)
         draw(result)
         return result
 
@@ -234,7 +232,6 @@ class Run(abc.ABC):
 
     def _claim_folder(self) -> None:
         """Writes the configuration, or checks that the folder's is the same."""
-        self.folder.mkdir(parents=True, exist_ok=True)
         path = self.folder / "config.json"
         mine = assemble.to_dict(self.config)
         if path.is_file():
@@ -243,4 +240,4 @@ class Run(abc.ABC):
             if changed:
                 raise ValueError(f"workdir: {self.folder} holds another run: {'; '.join(changed)}")
         else:
-            results.write_json(path, mine)
+            files.write_json(path, mine)

@@ -1,9 +1,7 @@
-"""Guards of a run's folder and of its process: one trainer at a time, and a stop that loses nothing."""
+"""A stop that loses nothing: the signals that tell a run to end."""
 
 import contextlib
-import fcntl
 import os
-import pathlib
 import signal
 import socket
 import sys
@@ -12,27 +10,6 @@ from collections.abc import Iterator
 
 _SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 """The signals that tell a run to stop."""
-
-
-@contextlib.contextmanager
-def one_trainer(folder: pathlib.Path) -> Iterator[None]:
-    """Holds the folder's lock; it is free again when this process has ended, however it ended.
-
-    Raises:
-        ValueError: if another process holds it; the message says which.
-    """
-    with (folder / "lock").open("a+") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            file.seek(0)
-            raise ValueError(
-                f"workdir: {folder} is in use by {file.read().strip()}, expected no other trainer"
-            ) from error
-        file.truncate(0)
-        file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
-        file.flush()
-        yield
 
 
 class Stop:

@@ -9,6 +9,7 @@ import numpy as np
 
 from milx.config.schema import Config, ConvConfig
 from milx.core.checkpoint import UNVALIDATED, Checkpoints
+from milx.core.files import FileError
 from milx.evaluation import provenance
 from milx.methods.whitening import Whitening
 from milx.networks import fixed_filters
@@ -90,12 +91,29 @@ def restore_state(
     """
     like = {"params": state.params, "trainer": (state.step, state.optimizer)}
     items, extra = checkpoints.restore(step, like)
-    if extra["dataset_hash"] != dataset_hash:
-        old, new = extra["dataset_hash"][:12], dataset_hash[:12]
+    hash_then, seconds = parse_extra(checkpoints, step, extra)
+    if hash_then != dataset_hash:
+        old, new = hash_then[:12], dataset_hash[:12]
         raise ValueError(
             f"workdir: {checkpoints.folder.parent} was trained on demonstrations {old}, but there are {new} now; "
             "expected the data set, or the device and versions that planned them, with which the run began, or another "
             "folder"
         )
     updates, optimizer = items["trainer"]
-    return TrainState(updates, items["params"], optimizer), extra["seconds"]
+    return TrainState(updates, items["params"], optimizer), seconds
+
+
+def parse_extra(checkpoints: Checkpoints, step: int, extra: dict[str, Any]) -> tuple[str, dict[str, float]]:
+    """Takes the hash of the demonstrations, and the seconds by part, out of the extra values of a checkpoint.
+
+    Raises:
+        FileError: if they are not there.
+    """
+    digest, seconds = extra.get("dataset_hash"), extra.get("seconds")
+    if not isinstance(digest, str) or not isinstance(seconds, dict):
+        raise FileError(
+            f"{checkpoints.folder / str(step)}: expected the run's dataset_hash and seconds beside the arrays"
+        )
+    if not all(isinstance(value, int | float) for value in seconds.values()):
+        raise FileError(f"{checkpoints.folder / str(step)}: seconds: got {seconds!r:.200}, expected numbers")
+    return digest, seconds

@@ -154,18 +154,18 @@ def test_nothing_outside_the_folder_is_read(copy, path):
     shutil.copy(ROOT / "data/chunk-000/file-000.parquet", copy.parent / "secret.parquet")
     (copy / "linked").symlink_to(copy.parent / "secret.parquet")
     change_info(copy, data_path=path)
-    with pytest.raises(ValueError, match=r"leads out of the data set's folder|is missing"):
+    with pytest.raises(ValueError, match=r"leads out of the folder|is missing"):
         open_set(copy).episodes("task_index")
     outside = "videos/../../../" + "x" * 3
     change_info(copy, data_path="data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet", video_path=outside)
-    with pytest.raises(ValueError, match="leads out of the data set's folder"):
+    with pytest.raises(ValueError, match="leads out of the folder"):
         open_set(copy).episodes("task_index")[0].read()
 
 
 def test_a_linked_episodes_folder_is_not_followed(copy):
     shutil.move(copy / "meta/episodes/chunk-000", copy.parent / "elsewhere")
     (copy / "meta/episodes/chunk-000").symlink_to(copy.parent / "elsewhere")
-    with pytest.raises(ValueError, match="leads out of the data set's folder"):
+    with pytest.raises(ValueError, match="leads out of the folder"):
         open_set(copy).episodes("task_index")
 
 

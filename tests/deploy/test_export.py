@@ -13,6 +13,7 @@ import milx
 from milx import methods
 from milx.config import assemble
 from milx.config.assemble import make_config
+from milx.deploy import standalone
 from milx.deploy.policy import Policy
 from milx.export import export
 from milx.methods.whitening import Whitening
@@ -122,3 +123,36 @@ def test_programs_are_for_cpu_and_cuda_and_other_inputs_are_refused(tmp_path):
             policy.adapt(**arguments)
     with pytest.raises(ValueError, match=r"state: got shape \[70, 8\], expected \[..., 8\]"):
         policy.act(task_params, image=image[0], state=state)
+
+
+def test_a_file_that_is_not_the_exported_one_is_refused(tmp_path):
+    """Changes one byte in the middle of every file, and removes it; policy.json says what the others must be."""
+    folder = tmp_path / "exported"
+    export(make_policy(), folder)
+    for name in ("adapt.bin", "act.bin", "params.npz", "policy.json"):
+        content = (folder / name).read_bytes()
+        middle = len(content) // 2
+        (folder / name).write_bytes(content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :])
+        with pytest.raises(ValueError, match=rf"{name}: (has changed since the export|expected what the export)"):
+            standalone.Policy(folder)
+        (folder / name).unlink()
+        with pytest.raises(ValueError, match=f"{name}: cannot be read: No such file or directory"):
+            standalone.Policy(folder)
+        (folder / name).write_bytes(content)
+    values = json.loads((folder / "policy.json").read_text())
+    for change in ({"format": 2}, {"inputs": 3, "sha256": []}, {"sha256": None}):
+        (folder / "policy.json").write_text(json.dumps(values | change))
+        with pytest.raises(ValueError, match=r"policy\.json: expected what the export of a policy writes"):
+            standalone.Policy(folder)
+
+
+def test_an_exported_policy_never_returns_what_is_not_finite(tmp_path):
+    export(make_policy(), tmp_path / "exported")
+    policy = standalone.Policy(tmp_path / "exported")
+    image = np.zeros((16, 20, 3), np.uint8)
+    good, huge = ({"image": image, "state": np.full(8, value, np.float32)} for value in (0.0, 3e38))
+    demo = {"image": np.zeros((T, 16, 20, 3), np.uint8), "state": np.zeros((T, 8)), "action": np.zeros((T, 2))}
+    task_params = policy.adapt(**demo)
+    assert np.isfinite(policy.act(task_params, **good)).all()
+    with pytest.raises(ValueError, match=r"action: got \[.*\], expected finite numbers"):
+        policy.act(task_params, **huge)

@@ -1,6 +1,7 @@
 """The policy that users hold, and what it says to bad demonstrations."""
 
 import dataclasses
+import pickle
 import re
 
 import jax
@@ -84,6 +85,63 @@ def test_act_is_the_method_s(policy, demo, task_params):
         np.testing.assert_allclose(policy.act(task_params, observation), expected, rtol=0, atol=1e-5)
     before = policy.act(policy.params, observation)
     assert np.abs(before - expected).max() > 1e-4, "the demonstration matters"
+
+
+@pytest.fixture(scope="module")
+def seen(demo):
+    return milx.Observation(*jax.tree.map(lambda x: x[0, 0], (demo.image, demo.state)))
+
+
+def test_adapt_and_act_are_pure_functions_under_jit(policy, demo, task_params, seen):
+    """Adapts and acts inside one program whose inputs are all traced."""
+
+    @jax.jit
+    def act(params, demo, seen):
+        return policy.act(policy.adapt(params, demo), seen)
+
+    expected = policy.act(task_params, seen)
+    np.testing.assert_allclose(act(policy.params, demo, seen), expected, rtol=0, atol=1e-5)
+
+
+def test_act_under_vmap_is_a_loop(policy, demo, task_params):
+    """Acts on all time steps at once; convolutions of several images may round otherwise."""
+    frames = milx.Observation(*jax.tree.map(lambda x: x[0, :4], (demo.image, demo.state)))
+    at_once = jax.vmap(policy.act, in_axes=(None, 0))(task_params, frames)
+    one_by_one = [policy.act(task_params, jax.tree.map(lambda x, i=i: x[i], frames)) for i in range(4)]
+    np.testing.assert_allclose(at_once, np.stack(one_by_one), rtol=0, atol=1e-5)
+
+
+def test_the_gradient_through_adaptation_is_a_finite_difference(policy, demo, seen):
+    """Differentiates an action by a bias of the parameters before adaptation, as meta-training does."""
+    bias = ["policy", "controller", "Dense_0", "bias"]
+
+    def action(shift):
+        params = jax.tree_util.tree_map_with_path(
+            lambda path, x: x + shift * jnp.cos(jnp.arange(x.size)) if [key.key for key in path] == bias else x,
+            {"policy": policy.params["policy"]},
+        )
+        return policy.act(policy.adapt(policy.params | params, demo), seen).sum()
+
+    step = 1e-2
+    slope = jax.jit(jax.grad(action))(0.0)
+    numeric = (action(step) - action(-step)) / (2 * step)
+    assert abs(slope) > 1e-3
+    np.testing.assert_allclose(slope, numeric, rtol=0.05)
+
+
+def test_a_pickled_policy_acts_alike(policy, task_params, seen):
+    sent = pickle.loads(pickle.dumps(policy))
+    assert (sent.config, sent.spec) == (policy.config, policy.spec)
+    jax.tree.map(np.testing.assert_array_equal, sent.params, policy.params)
+    np.testing.assert_array_equal(sent.act(task_params, seen), policy.act(task_params, seen))
+
+
+def test_an_action_that_is_not_finite_is_an_error(policy, task_params, seen):
+    """Acts with parameters and on a state that are finite, but whose products are not."""
+    with pytest.raises(ValueError, match=r"action: got \[.*\], expected finite numbers"):
+        policy.act(jax.tree.map(lambda x: x * 1e38, task_params), seen)
+    with pytest.raises(ValueError, match=r"action: got \[.*\], expected finite numbers"):
+        policy.act(task_params, dataclasses.replace(seen, state=np.full(S, 3e38, np.float32)))
 
 
 @pytest.mark.parametrize(

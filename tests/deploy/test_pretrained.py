@@ -2,6 +2,7 @@
 
 import json
 import pathlib
+import shutil
 
 import jax
 import numpy as np
@@ -55,3 +56,20 @@ def test_what_is_saved_is_loaded(tmp_path, monkeypatch):
     assert loaded.config == config
     with pytest.raises(ValueError, match=r"run: got 'yours', expected the folder of a run, or one of mine, which ship"):
         milx.load("yours")
+
+
+def test_parameters_that_have_changed_are_refused(tmp_path, monkeypatch):
+    """Replaces the shipped parameters by zeros of the same shapes."""
+    shutil.copytree(pretrained.FOLDER / "reach", tmp_path / "reach")
+    monkeypatch.setattr(pretrained, "FOLDER", tmp_path)
+    params = milx.load("reach").params
+    pytrees.write(tmp_path / "reach" / "params.npz", jax.tree.map(np.zeros_like, params))
+    with pytest.raises(ValueError, match=r"params\.npz: has changed, expected the parameters that ship with milx"):
+        milx.load("reach")
+
+
+def test_a_folder_of_the_same_name_comes_first_and_is_reported(trained, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "reach").symlink_to(trained.folder)
+    assert milx.load("reach").config == trained.config
+    assert "loading the run in ./reach, not the policy 'reach' that ships with milx" in capsys.readouterr().err

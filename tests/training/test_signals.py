@@ -1,7 +1,5 @@
-"""One trainer for a folder, and a process that is told to stop."""
+"""A process that is told to stop."""
 
-import os
-import pathlib
 import signal
 import subprocess
 import sys
@@ -9,17 +7,6 @@ import textwrap
 import time
 
 import pytest
-
-from milx.training import signals
-
-HOLD = """
-import pathlib, sys, time
-from milx.training import signals
-with signals.one_trainer(pathlib.Path(sys.argv[1])):
-    print("held", flush=True)
-    time.sleep(60)
-"""
-
 
 SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
@@ -29,22 +16,6 @@ def start(program, *arguments):
     command = [sys.executable, "-c", textwrap.dedent(program), *map(str, arguments)]
     defaults = lambda: [signal.signal(number, signal.SIG_DFL) for number in SIGNALS]  # noqa: E731
     return subprocess.Popen(command, stdout=subprocess.PIPE, text=True, preexec_fn=defaults)
-
-
-def test_a_second_trainer_is_refused_while_the_first_lives_and_admitted_after_it_died(tmp_path):
-    first = start(HOLD, tmp_path)
-    assert first.stdout.readline() == "held\n"
-    held = rf"workdir: .* is in use by process {first.pid} on .*, expected no other"
-    with pytest.raises(ValueError, match=held), signals.one_trainer(tmp_path):
-        pass
-    first.kill()
-    first.wait()
-    with signals.one_trainer(tmp_path):
-        assert f"process {os.getpid()} " in (tmp_path / "lock").read_text()
-        with pytest.raises(ValueError, match=rf"in use by process {os.getpid()} "), signals.one_trainer(tmp_path):
-            pass
-    with signals.one_trainer(pathlib.Path(tmp_path)):
-        pass
 
 
 NUMBERS = pytest.mark.parametrize("number", SIGNALS, ids=lambda number: number.name)

@@ -1,0 +1,230 @@
+"""Files that are whole or not there, whatever fails, and that are refused if they are links, too large or damaged."""
+
+import errno
+import json
+import os
+import pathlib
+import resource
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from milx.core import files
+from milx.core.files import FileError
+
+HOLD = """
+import pathlib, sys, time
+from milx.core import files
+with files.{holder}(pathlib.Path(sys.argv[1])):
+    print("held", flush=True)
+    time.sleep(60)
+"""
+
+
+def hold(holder, path):
+    """Starts a process that waits inside a function of `files`."""
+    command = [sys.executable, "-c", HOLD.format(holder=holder), str(path)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    assert process.stdout.readline() == "held\n"
+    return process
+
+
+def end(process):
+    process.kill()
+    process.wait()
+
+
+WRITERS = {
+    "bytes": lambda path, value: files.write_bytes(path, bytes([value]) * 5000),
+    "json": lambda path, value: files.write_json(path, [value] * 500),
+    "arrays": lambda path, value: files.write_arrays(path, {"a": np.full(5000, value)}),
+}
+READERS = {
+    "bytes": lambda path: files.read_bytes(path)[-1],
+    "json": lambda path: files.read_json(path)[-1],
+    "arrays": lambda path: files.read_arrays(path)["a"][-1],
+}
+
+
+class Faults:
+    """Makes the n-th operation fail of those that write: creating, opening, synchronizing, renaming."""
+
+    NAMES = (("open", os), ("fsync", os), ("replace", pathlib.Path), ("touch", pathlib.Path), ("open", pathlib.Path))
+
+    def __init__(self, patch, number, error):
+        self.number, self.error, self.count = number, error, 0
+        for name, owner in self.NAMES:
+            patch.setattr(owner, name, self._failing(getattr(owner, name)))
+
+    def _failing(self, function):
+        def call(*args, **kwargs):
+            self.count += 1
+            if self.count == self.number:
+                raise OSError(self.error, os.strerror(self.error))
+            return function(*args, **kwargs)
+
+        return call
+
+
+@pytest.mark.parametrize("error", [errno.ENOSPC, errno.EIO, errno.EDQUOT], ids=errno.errorcode.get)
+@pytest.mark.parametrize("kind", WRITERS)
+def test_whichever_operation_fails_the_file_is_the_old_one_or_the_new_one(tmp_path, monkeypatch, kind, error):
+    """Fails every operation in turn: an error that names the file, one of the two contents, and no leftovers."""
+    path = tmp_path / "folder" / "file"
+    WRITERS[kind](path, 1)
+    for number in range(1, 100):
+        WRITERS[kind](path, 1)
+        with monkeypatch.context() as patch:
+            faults = Faults(patch, number, error)
+            try:
+                WRITERS[kind](path, 2)
+            except FileError as failure:
+                assert str(failure) == f"{path}: cannot be written: {os.strerror(error)}"
+                failed = True
+            else:
+                failed = False
+        if faults.count < number:
+            break
+        assert READERS[kind](path) in ((1, 2) if failed else (2,))
+        assert [found.name for found in path.parent.iterdir()] == ["file"]
+    assert number > 5
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+def test_a_short_write_leaves_the_old_file(tmp_path, kind):
+    """Limits the size of files, as a full disk does after some bytes."""
+    path = tmp_path / "file"
+    WRITERS[kind](path, 1)
+    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20, limits[1]))
+    try:
+        with pytest.raises(FileError, match="file: cannot be written: File too large"):
+            WRITERS[kind](path, 2)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, before)
+    assert READERS[kind](path) == 1
+    assert [found.name for found in tmp_path.iterdir()] == ["file"]
+
+
+@pytest.mark.parametrize(("holder", "name"), [("replacing", "file"), ("creating", "folder")])
+def test_leftovers_of_killed_processes_are_removed_and_those_of_others_are_not(tmp_path, holder, name):
+    process = hold(holder, tmp_path / name)
+    (partial,) = tmp_path.iterdir()
+    files.write_bytes(tmp_path / "other", b"")
+    assert partial.exists(), "its process lives"
+    end(process)
+    files.write_bytes(tmp_path / "other", b"")
+    assert [found.name for found in tmp_path.iterdir()] == ["other"]
+
+
+def test_two_processes_write_the_same_file(tmp_path):
+    """Writes while another process writes the same file: both names differ, so both files are whole."""
+    process = hold("replacing", tmp_path / "file")
+    files.write_bytes(tmp_path / "file", b"mine")
+    assert (tmp_path / "file").read_bytes() == b"mine"
+    assert len(list(tmp_path.iterdir())) == 2
+    end(process)
+
+
+def test_a_lock_is_held_by_one_process_and_is_free_when_it_has_died(tmp_path):
+    lock = tmp_path / "lock"
+    first = hold("locked", lock)
+    with (
+        pytest.raises(FileError, match=rf"is in use by process {first.pid} on .*, expected no other"),
+        files.locked(lock),
+    ):
+        pass
+    end(first)
+    with files.locked(lock):
+        assert f"process {os.getpid()} " in lock.read_text()
+        with pytest.raises(FileError, match=rf"in use by process {os.getpid()} "), files.locked(lock):
+            pass
+    with files.locked(lock):
+        pass
+
+
+def test_a_folder_appears_whole_or_not_at_all(tmp_path):
+    with pytest.raises(ZeroDivisionError), files.creating(tmp_path / "set") as partial:
+        (partial / "file").write_text("a")
+        raise ZeroDivisionError
+    assert not list(tmp_path.iterdir())
+    with files.creating(tmp_path / "set") as partial:
+        (partial / "file").write_text("a")
+        assert not (tmp_path / "set").exists()
+    assert (tmp_path / "set" / "file").read_text() == "a"
+    with pytest.raises(FileError, match="exists, expected a folder that does not"), files.creating(tmp_path / "set"):
+        pass
+
+
+def test_links_are_not_followed(tmp_path):
+    (tmp_path / "secret.json").write_text("[1]")
+    root = tmp_path / "root"
+    (root / "inner").mkdir(parents=True)
+    (root / "file").write_text("a")
+    (root / "link").symlink_to(root / "file")
+    (root / "out").symlink_to(tmp_path)
+    with pytest.raises(FileError, match="link: is a link, expected a file"):
+        files.read_bytes(root / "link")
+    for path in ("link", "out/secret.json", "../secret.json", "/etc/passwd", "x" * 5000, "nothing", "a\0b"):
+        with pytest.raises(FileError, match="expected"):
+            files.inside(root, path)
+    assert files.inside(root, "file") == root / "file"
+    with pytest.raises(FileError, match=r"(link|out): is a link, expected a file or a folder"):
+        files.refuse_links(root)
+
+
+def test_what_is_too_large_is_refused_before_it_is_read(tmp_path, monkeypatch):
+    """Reads a file that would be a terabyte, and an archive whose arrays would be."""
+    huge = tmp_path / "huge"
+    with huge.open("wb") as file:
+        file.truncate(1 << 40)
+    with pytest.raises(FileError, match=f"huge: got {1 << 40} bytes, expected at most {files.MAX_BYTES}"):
+        files.read_bytes(huge)
+    with pytest.raises(FileError, match=f"huge: got {1 << 40} bytes"):
+        files.sha256(huge)
+    with pytest.raises(FileError, match=f"expected at most {files.MAX_JSON_BYTES}"):
+        files.read_json(huge)
+    files.write_arrays(tmp_path / "arrays", {"a": np.zeros(5000)})
+    monkeypatch.setattr(files, "MAX_BYTES", 5000)
+    assert (tmp_path / "arrays").stat().st_size < 5000
+    with pytest.raises(FileError, match=r"arrays: got .* GiB of arrays, expected at most"):
+        files.read_arrays(tmp_path / "arrays")
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe", b"[" * 100_000, b"PK\x03\x04garbage", b"\x93NUMPY"])
+def test_damaged_contents_are_one_kind_of_error(tmp_path, content):
+    (tmp_path / "file").write_bytes(content)
+    with pytest.raises(FileError, match=r"file: expected JSON: "):
+        files.read_json(tmp_path / "file")
+    with pytest.raises(FileError, match=r"file: expected an \.npz file of arrays: "):
+        files.read_arrays(tmp_path / "file")
+
+
+def test_pickles_are_not_opened(tmp_path):
+    np.savez(tmp_path / "objects.npz", a=np.array([{}], object))
+    with pytest.raises(FileError, match=r"expected an \.npz file of arrays"):
+        files.read_arrays(tmp_path / "objects.npz")
+
+
+def test_what_is_no_file_is_refused(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    for name in ("pipe", ".", "nothing"):
+        with pytest.raises(FileError, match=r"expected a file|cannot be read: (Is a directory|No such file)"):
+            files.read_bytes(tmp_path / name)
+
+
+def test_permissions_are_those_of_other_files(tmp_path):
+    """Compares with a file and a folder that Python makes: the umask decides."""
+    (tmp_path / "file").write_text("")
+    (tmp_path / "folder").mkdir()
+    files.write_json(tmp_path / "mine", 1)
+    with files.creating(tmp_path / "mine_too"):
+        pass
+    assert (tmp_path / "mine").stat().st_mode == (tmp_path / "file").stat().st_mode
+    assert (tmp_path / "mine_too").stat().st_mode == (tmp_path / "folder").stat().st_mode
+    assert json.loads((tmp_path / "mine").read_text()) == 1
