@@ -29,9 +29,10 @@ def main(argv: list[str]) -> None:
     if not path.is_file():
         fail(f"workdir: {path.parent} has no config.json, expected a folder of `python -m milx.train`")
     try:
+        platform.require_device()
         run = make_run(assemble.read(path), path.parent)
         run.report(run.evaluate())
-    except (ValueError, OSError, RuntimeError) as error:  # the last if JAX finds no device
+    except (ValueError, OSError) as error:
         fail(error)
 
 

@@ -20,8 +20,9 @@ def main(argv: list[str]) -> None:
     logging.set_verbosity(logging.WARNING)
     platform.configure()
     try:
+        platform.require_device()
         export(load(argv[1]), argv[2], flags.FLAGS.shots)
-    except (ValueError, OSError, RuntimeError) as error:  # the last if JAX finds no device
+    except (ValueError, OSError) as error:
         fail(error)
     size = sum(path.stat().st_size for path in pathlib.Path(argv[2]).iterdir())
     print(f"{argv[2]}: {size / 1e6:.1f} MB. To load it, use `from policy import Policy` in that folder.")

@@ -6,7 +6,6 @@ Letters used in shapes throughout the project:
 """
 
 import dataclasses
-import math
 from typing import Any
 
 import jax
@@ -157,7 +156,7 @@ def _as_tuple(value: Any) -> Any:
 
 
 def _is_table(value: Any, shape: tuple[int, ...], low: int | None = None, high: int = 0) -> bool:
-    """Tells whether a value is a nested tuple of this shape: finite numbers, or integers from `low` below `high`."""
+    """Tells whether a value is a nested tuple of this shape: numbers, or integers from `low` below `high`."""
     if shape:
         return (
             isinstance(value, tuple)
@@ -165,5 +164,5 @@ def _is_table(value: Any, shape: tuple[int, ...], low: int | None = None, high: 
             and all(_is_table(each, shape[1:], low, high) for each in value)
         )
     if low is None:
-        return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+        return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e30
     return type(value) is int and low <= value < high

@@ -5,7 +5,6 @@ to `damaged/` beside the folder of checkpoints. Nothing is lost, and checkpoints
 """
 
 import contextlib
-import math
 import pathlib
 import shutil
 import sys
@@ -267,9 +266,7 @@ def _bad_score(checkpoint: pathlib.Path) -> str | None:
     except FileError as error:
         return str(error)
     score = values.get("success") if isinstance(values, dict) else None
-    return (
-        None if isinstance(score, int | float) and math.isfinite(score) else f"its score is {score!r:.100}, no number"
-    )
+    return None if isinstance(score, int | float) and abs(score) < 1e30 else f"its score is {score!r:.100}, no number"
 
 
 def _unreadable(checkpoint: pathlib.Path) -> str | None:

@@ -55,6 +55,19 @@ def configure() -> None:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
+def require_device() -> None:
+    """Starts JAX's backend.
+
+    Raises:
+        ValueError: if it finds no device, for example because JAX_PLATFORMS names one that is not there.
+    """
+    try:
+        jax.devices()
+    except Exception as error:  # a platform may raise any type
+        asked = os.environ.get("JAX_PLATFORMS", "")
+        raise ValueError(f"JAX_PLATFORMS: got {asked!r}, expected a platform with a device: {error!r:.300}") from error
+
+
 def warn_if_not_configured() -> None:
     """Warns if XLA flags are missing without which an MJX program may compile for hours, or wait forever.
 

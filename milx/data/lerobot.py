@@ -214,7 +214,7 @@ def read_video(file: pathlib.Path, start: float, count: int, fps: float) -> Iter
                     wanted += 1
                 if wanted == count:
                     return
-    except (av.FFmpegError, IndexError) as error:
+    except Exception as error:  # besides FFmpeg's errors, those of metadata that are no text
         raise ValueError(f"{file}: expected a video that can be read: {error}") from error
     raise ValueError(f"{file}: expected a frame at {start + wanted / fps:.3f} s, there is none")
 

@@ -110,6 +110,7 @@ def parse(argv: Sequence[str], values: flags.FlagValues = FLAGS) -> list[str]:
         raise flags.Error("--coordinator, --num_processes and --process_id: got some of them, expected all or none")
     try:
         parallel.join_hosts(*hosts)
+        platform.require_device()
         load_plugins()
         preset = values.preset or ("cpu" if jax.default_backend() == "cpu" else "fast")
         if values.data is None and values.env == RECORDED:
@@ -118,7 +119,7 @@ def parse(argv: Sequence[str], values: flags.FlagValues = FLAGS) -> list[str]:
             config = assemble.make_config(values.env, values.method, preset, values.seed)
         else:
             config = recorded.config_for(values.data, values.method, preset, values.seed)
-    except (ValueError, OSError, RuntimeError) as error:  # the last if JAX finds no device
+    except (ValueError, OSError) as error:
         raise flags.Error(str(error)) from error
     _check_fields(argv, config)
     unset = [arg for arg in argv if arg.startswith("--config.") and arg.endswith("=None")]

@@ -5,12 +5,14 @@ import json
 import pathlib
 import resource
 import signal
+import time
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from milx.core import checkpoint
 from milx.core.checkpoint import UNVALIDATED, Checkpoints
 
 LIKE = {"params": {"a": jnp.zeros((3, 4)), "b": jnp.zeros(5)}, "trainer": (jnp.zeros((), jnp.int32), [jnp.zeros(2)])}
@@ -235,3 +237,41 @@ def test_arrays_without_entries_come_back(tmp_path):
     jax.tree.map(np.testing.assert_array_equal, found, tree)
     assert found["params"]["empty"].shape == (0, 3)
     checkpoints.close()
+
+
+def rewritten(folder, name, values):
+    """Replaces a JSON file of the newest checkpoint, with checksums that fit."""
+    (folder / "20" / name).write_text(json.dumps(values))
+    checkpoint._write_checksums(folder / "20")
+
+
+@pytest.mark.parametrize(
+    "score",
+    ["high", None, [1], {"a": 1}, 1e999, True * 10**400],
+    ids=lambda score: f"{score:.9}" if isinstance(score, str) else type(score).__name__,
+)
+def test_a_score_that_is_no_number_is_damage(folder, tmp_path, score):
+    mine, reports = copy(folder, tmp_path / "checkpoints"), []
+    rewritten(mine, "metrics/metrics", {"success": score})
+    assert Checkpoints(mine, read_only=True, report=reports.append).latest == 10
+    assert "20 is damaged and not used: its score is" in reports[0]
+
+
+@pytest.mark.parametrize("extra", [3, [], {"format": 2}, {"format": "x"}])
+def test_extra_values_of_another_format_are_refused(folder, tmp_path, extra):
+    mine = copy(folder, tmp_path / "checkpoints")
+    rewritten(mine, "extra/metadata", extra)
+    with pytest.raises(ValueError, match=r"20: (expected format 1: made by a later milx|cannot be restored)"):
+        Checkpoints(mine, read_only=True, report=print).restore(20, LIKE)
+
+
+def test_a_file_that_is_far_too_large_is_damage_and_is_not_read(folder, tmp_path):
+    """Appends a hole of 200 GiB to a file of the checkpoint."""
+    mine, reports = copy(folder, tmp_path / "checkpoints"), []
+    path = next(path for path in (mine / "20" / "params").rglob("*") if path.is_file())
+    with path.open("ab") as file:
+        file.truncate(200 << 30)
+    began = time.monotonic()
+    assert Checkpoints(mine, read_only=True, report=reports.append).latest == 10
+    assert f"got {200 << 30} bytes, expected at most" in reports[0]
+    assert time.monotonic() - began < 30

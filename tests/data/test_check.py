@@ -118,3 +118,16 @@ def test_splits_depend_on_names_alone_and_have_their_sizes():
     for parts, message in (((-0.1, 0.1), "validation: got -0.1"), ((0.5, 0.5), r"validation \+ test: got 1.0")):
         with pytest.raises(ValueError, match=message):
             assign_splits(names, *parts)
+
+
+def test_names_cannot_speak_to_the_terminal(tmp_path):
+    """Names a task and a source with escape sequences and half a character: they are shown escaped."""
+    name = "\x1b[31mred\x1b]0;title\x07 \ud800 caf\u00e9"
+    with Writer(tmp_path / "set", (8, 8), 2, 2, name) as writer:
+        for split, demos in well():
+            writer.add(name + split, split, [len(demo.state) for demo in demos], demos)
+    out = io.StringIO()
+    check.describe(DataSet(tmp_path / "set"), Console(file=out, width=200, markup=False))
+    assert "\\x1b[31mred\\x1b]0;title\\x07 \\ud800 caf\u00e9" in out.getvalue()
+    assert not {"\x1b", "\x07", "\ud800"} & set(out.getvalue())
+    assert set(assign_splits([name, "a", "b"], 0.3, 0.3).values()) == {"train", "validation", "test"}

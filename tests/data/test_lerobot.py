@@ -1,5 +1,6 @@
 """LeRobot's data sets: one that the real writer wrote, and damaged or hostile copies of it."""
 
+import io
 import json
 import pathlib
 import shutil
@@ -9,6 +10,7 @@ import numpy as np
 import pyarrow
 import pyarrow.parquet
 import pytest
+from PIL import Image
 
 from milx.data import check, dataset, episodes, lerobot
 from milx.data.dataset import DataSet
@@ -199,3 +201,22 @@ def test_damaged_sets_are_refused(copy, damage, message):
     damage(copy)
     with pytest.raises(ValueError, match=message):
         open_set(copy).episodes("task_index")[0].read()
+
+
+def test_a_playlist_in_place_of_a_video_is_not_played(copy):
+    """Replaces every video by a list for FFmpeg's concat demuxer, which would open the video outside the folder."""
+    outside = shutil.copy(next(copy.glob("videos/**/*.mp4")), copy.parent / "outside.mp4")
+    for path in copy.glob("videos/**/*.mp4"):
+        path.write_text(f"ffconcat version 1.0\nfile {outside}\n")
+    with pytest.raises(ValueError, match=r"mp4: expected a video that can be read"):
+        open_set(copy).episodes("task_index")[0].read()
+
+
+def test_images_are_png_or_jpeg(copy):
+    """Shows PostScript and BMP, for which Pillow has readers, too; the first one starts Ghostscript."""
+    postscript = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n"
+    bitmap = io.BytesIO()
+    Image.new("RGB", (4, 4)).save(bitmap, "BMP")
+    for content in (postscript, bitmap.getvalue()):
+        with pytest.raises(ValueError, match="expected an image that can be read"):
+            list(lerobot._images(copy, [{"bytes": content}]))

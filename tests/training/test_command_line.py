@@ -157,3 +157,25 @@ def test_help_shows_the_flags_and_their_choices(train):
         assert re.search(rf"^\s*--(\[no\])?{flag}:", said, re.MULTILINE), flag
     assert "--config.path.to.field=value" in re.sub(r"\s+", "", said)
     assert "meta-trains a policy on them, and evaluates it" in said
+
+
+@pytest.mark.parametrize(
+    ("variables", "message"),
+    [
+        ({"SLURM_STEP_NUM_TASKS": "many"}, "SLURM_STEP_NUM_TASKS: got 'many', expected a number, as SLURM sets it"),
+        ({"SLURM_STEP_NUM_TASKS": "2", "SLURM_JOB_ID": "x"}, "hosts: cannot be joined, expected addresses that answer"),
+        ({"JAX_PLATFORMS": "cuda"}, "JAX_PLATFORMS: got 'cuda', expected a platform with a device"),
+        ({"JAX_PLATFORMS": "nope"}, "JAX_PLATFORMS: got 'nope', expected a platform with a device"),
+    ],
+    ids=lambda value: next(iter(value), None) if isinstance(value, dict) else None,
+)
+def test_an_odd_environment_ends_with_a_message(tmp_path, variables, message):
+    cleaned = {name: value for name, value in os.environ.items() if not name.startswith(("SLURM", "JAX_PLATFORMS"))}
+    command = [sys.executable, "-m", "milx.train", "--workdir=run"]
+    done = subprocess.run(
+        command, cwd=tmp_path, env=cleaned | variables, capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.returncode == 1
+    assert "Traceback" not in done.stderr
+    assert message in done.stderr.splitlines()[-1]
+    assert not (tmp_path / "run").exists()

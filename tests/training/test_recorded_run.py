@@ -4,7 +4,10 @@ import contextlib
 import dataclasses
 import io
 import json
+import resource
+import shutil
 import signal
+import time
 
 import jax
 import jax.numpy as jnp
@@ -14,14 +17,16 @@ from rich.console import Console
 from tiny import QUIET
 
 import milx
+from milx.config import assemble
 from milx.core.checkpoint import UNVALIDATED, Checkpoints
 from milx.data.dataset import DataSet, Writer
 from milx.deploy import standalone
+from milx.deploy.policy import read_spec
 from milx.export import export
 from milx.methods.mil import MIL
 from milx.training import recorded, signals
 from milx.training.factory import make_run
-from milx.training.metrics import MetricsWriter
+from milx.training.metrics import MetricsWriter, read_metrics
 from milx.training.recorded import RecordedRun
 from milx.types import Demo
 
@@ -146,28 +151,29 @@ def test_an_interrupted_run_ends_bit_for_bit_like_the_uninterrupted_one(
         patch.setattr(RecordedRun, "_validate", stop)
         with pytest.raises(KeyboardInterrupt):
             final(tmp_path / "stopped")
-    with monkeypatch.context() as patch:
-        write, told = MetricsWriter.write, []
+    for name, last in (("terminated", 100), ("terminated late", 200)):
+        with monkeypatch.context() as patch:
+            write, told = MetricsWriter.write, []
 
-        def terminate(self, step, values):
-            told.append(step)
-            write(self, step, values)
+            def terminate(self, step, values, write=write, told=told, last=last):
+                if step == last:
+                    told.append(step)
+                write(self, step, values)
 
-        patch.setattr(MetricsWriter, "write", terminate)
-        patch.setattr(signals.Stop, "listen", contextlib.nullcontext)
-        patch.setattr(
-            signals.Stop, "asked", property(lambda _: told and signal.SIGTERM, lambda *_: None), raising=False
-        )
-        with pytest.raises(SystemExit) as ended:
-            final(tmp_path / "terminated")
-    assert ended.value.code == 143
-    assert "milx: stopped at step 100; the same command goes on from there" in capsys.readouterr().out
+            patch.setattr(MetricsWriter, "write", terminate)
+            patch.setattr(signals.Stop, "listen", contextlib.nullcontext)
+            asked = property(lambda _, told=told: told and signal.SIGTERM, lambda *_: None)
+            patch.setattr(signals.Stop, "asked", asked, raising=False)
+            with pytest.raises(SystemExit) as ended:
+                final(tmp_path / name)
+        assert ended.value.code == 143, "after the last update, too: nothing has been evaluated"
+        assert f"milx: stopped at step {last}; the same command goes on from there" in capsys.readouterr().out
     straight = final(tmp_path / "straight")
     best = Checkpoints(tmp_path / "straight" / "checkpoints", read_only=True).best
-    for name in ("stopped", "terminated"):
+    for name, step in (("stopped", 200), ("terminated", 100), ("terminated late", 200)):
         folder = tmp_path / name / "checkpoints"
         before = Checkpoints(folder, read_only=True)
-        assert before.latest == {"stopped": 200, "terminated": 100}[name]
+        assert before.latest == step
         assert before.score(before.latest) == UNVALIDATED
         jax.tree.map(np.testing.assert_array_equal, final(tmp_path / name), straight)
         after = Checkpoints(folder, read_only=True)
@@ -295,3 +301,106 @@ def test_the_report_names_the_floors(finished):
     text = run.console.export_text()
     assert f"{result['action_error']['after']:.3f}" in text
     assert f"mean action {result['action_error']['mean_action']:.3f}" in text
+
+
+def write_tasks(folder, change, action_size=2):
+    """Writes six tasks for training and two for each other split, after a change of every demonstration's action."""
+    rng = np.random.default_rng(0)
+    with Writer(folder, (12, 16), 3, action_size, "a test") as writer:
+        for task, split in enumerate(["train"] * 6 + ["validation", "test"] * 2):
+            demos = [random_demo(rng, np.array([0.6, 0.8]), 7) for _ in range(2)]
+            demos = [dataclasses.replace(demo, action=change(demo.action)) for demo in demos]
+            writer.add(f"task {task}", split, [7, 7], demos)
+    return folder
+
+
+@pytest.mark.parametrize("value", [1e25, -3e15, np.inf, np.nan])
+def test_numbers_whose_squares_are_not_finite_are_refused(cache, tmp_path, value):
+    def change(action):
+        action = action.copy()
+        action[3, 1] = value
+        return action
+
+    run = make_run(tiny_config(write_tasks(tmp_path / "set", change)), tmp_path / "run", QUIET)
+    expected = r"data: action of demonstration 0 of task 0 .*: got values that are not finite or too large, expected"
+    with pytest.raises(ValueError, match=expected):
+        run.train()
+
+
+def test_a_score_without_anything_to_learn_is_a_number(finished, folder):
+    """Divides by the error of the mean action, which is zero where all actions are the same."""
+    assert recorded._relative({"after": 0.3, "mean_action": 1.5}, "after") == pytest.approx(0.2)
+    assert recorded._relative({"after": 0.0, "mean_action": 0.0}, "after") == 0
+    assert np.isfinite(recorded._relative({"after": 0.3, "mean_action": 0.0}, "after"))
+
+
+def test_a_run_refuses_data_of_other_sizes_and_stays_as_it_is(finished, folder, tmp_path):
+    """Replaces the data set by one with another action, as an import into the same folder would."""
+    run, _ = finished
+    mine = shutil.copytree(run.folder, tmp_path / "run")
+    replaced = write_tasks(tmp_path / "set", lambda action: np.tile(action, 2), action_size=4)
+    before = (mine / "spec.json").read_bytes()
+    values = json.loads((mine / "config.json").read_text())
+    values["recorded"]["path"] = str(replaced)
+    (mine / "config.json").write_text(json.dumps(values))
+    with pytest.raises(ValueError, match=r"data: .*set has Spec\(.*action_size=4.*\), expected Spec\(.*action_size=2"):
+        make_run(assemble.read(mine / "config.json"), mine, QUIET)
+    assert (mine / "spec.json").read_bytes() == before
+    milx.load(mine)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        [],
+        3,
+        None,
+        "x",
+        {},
+        *({"state_size": size} for size in (-1, 1.5, "3", None, True, 10**30, [3])),
+        *({"action_size": size} for size in (0, -2, None)),
+        *({"image_shape": shape} for shape in ([12], [12, 16, 3], [0, 5], ["a", "b"], 12)),
+        *(
+            {"action_range": limits}
+            for limits in ([[0.0], [1.0]], [1, 2], [[0.0, 1.0], [2.0, None]], [[1e999, 0], [0, 0]])
+        ),
+        *({"goal_indices": indices} for indices in ([3], [-1], [0.5], 2, [[0]])),
+        {"image_to_goal": [[1.0], [2.0]]},
+        {"object_indices": [[0]]},
+        {"height_index": 9},
+        {"spec_version": 2},
+        {"new": 1},
+    ],
+    ids=lambda values: json.dumps(values)[:60],
+)
+def test_sizes_that_cannot_be_are_refused(finished, tmp_path, values):
+    """Changes the file with the sizes of the policy, or replaces it."""
+    run, _ = finished
+    good = json.loads((run.folder / "spec.json").read_text())
+    path = tmp_path / "spec.json"
+    path.write_text(json.dumps(good | values if isinstance(values, dict) and values else values))
+    with pytest.raises(ValueError, match=r"spec\.json: expected the sizes of a policy: .*(expected|no such field)"):
+        read_spec(path)
+
+
+def test_a_full_disk_stops_neither_training_nor_the_metrics_that_still_fit(tmp_path):
+    """Limits the size of files, as a full disk does: both files stop growing, are reported, and nobody waits."""
+    reports, before = [], signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    writer = MetricsWriter(tmp_path, 0, reports.append)
+    writer.write(1, {"loss": 1.0})
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (150, limits[1]))
+    began = time.monotonic()
+    try:
+        for step in range(2, 200):
+            writer.write(step, {"loss": 1.0, "validation_success": 0.5})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, before)
+    assert time.monotonic() - began < 20
+    assert sum("TensorBoard's events could not be written: " in report for report in reports) == 1
+    assert sum(report.startswith("metrics of step 199 could not be written: ") for report in reports) == 1
+    writer.write(200, {"loss": 0.5})  # there is room again
+    writer.close()
+    lines = read_metrics(tmp_path / "metrics.jsonl")
+    assert lines[0] == {"step": 1, "loss": 1.0}
