@@ -52,6 +52,22 @@ def test_the_policies_that_ship_act(installed):
     assert done.stdout.split() == [str(site / "milx" / "__init__.py"), milx.__version__]
 
 
+@pytest.mark.slow
+def test_the_wheel_is_reproducible(installed, tmp_path):
+    """Builds it twice more, at another time and from files of another age: both have the same bytes."""
+    _, site = installed
+    wheels = []
+    for age in (1, 2):
+        source = shutil.copytree(site.parent / "source", tmp_path / str(age))
+        for path in source.rglob("*"):
+            os.utime(path, (10**9 * age, 10**9 * age))
+        command = [sys.executable, "-m", "build", "--wheel", "--outdir", tmp_path / f"out{age}", source]
+        subprocess.run(command, check=True, env=os.environ | {"SOURCE_DATE_EPOCH": "1700000000"})
+        (wheel,) = (tmp_path / f"out{age}").iterdir()
+        wheels.append(wheel.read_bytes())
+    assert wheels[0] == wheels[1]
+
+
 def test_launchers_start(installed):
     run, _ = installed
     done = run("-m", "milx.train", "--config.train.steps=7")
