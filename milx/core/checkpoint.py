@@ -9,13 +9,14 @@ import pathlib
 import shutil
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
+from absl import logging
 from orbax.checkpoint import checkpoint_managers as policies
 
 from milx.core import files, parallel
@@ -78,8 +79,9 @@ class Checkpoints:
         saves = {name: ocp.args.StandardSave(jax.tree.map(_stored, tree)) for name, tree in items.items()}
         args = ocp.args.Composite(**saves, extra=ocp.args.JsonSave({"format": FORMAT, **extra}))
         try:
-            self._manager.save(step, args=args, metrics={"success": score})
-            self._manager.wait_until_finished()
+            with _silenced():
+                self._manager.save(step, args=args, metrics={"success": score})
+                self._manager.wait_until_finished()
             if parallel.is_first_host():
                 _write_checksums(self.folder / str(step))
         except Exception as error:  # several libraries raise their own types of errors, from their own threads
@@ -174,6 +176,7 @@ class Checkpoints:
             preservation_policy=keep,
             best_fn=lambda metrics: metrics["success"],
             create=not self._read_only,
+            enable_async_checkpointing=False,  # its threads keep a process alive whose disk has failed
             read_only=self._read_only,
         )
         return ocp.CheckpointManager(folder, options=options)
@@ -229,6 +232,17 @@ class Checkpoints:
                         _write_checksums(path)
             parallel.wait_for_all()
         return self.folder
+
+
+@contextlib.contextmanager
+def _silenced() -> Iterator[None]:
+    """Keeps Orbax from logging the tracebacks of errors that it raises as well."""
+    before = logging.get_verbosity()
+    logging.set_verbosity(logging.FATAL)
+    try:
+        yield
+    finally:
+        logging.set_verbosity(before)
 
 
 def _stored(x: Any) -> Any:
