@@ -1,4 +1,4 @@
-"""Lives that are disturbed once by each kind of failure, of which `experiments/robustness/failures.py` has many more."""
+"""Lives disturbed once by each kind of failure; `experiments/robustness/failures.py` has a life for every operation."""
 
 import concurrent.futures
 import pathlib
@@ -7,7 +7,7 @@ import sys
 import pytest
 
 sys.path.insert(0, str(pathlib.Path(__file__).parents[1] / "experiments" / "robustness"))
-import failures  # noqa: E402
+import failures
 
 pytestmark = pytest.mark.slow
 
