@@ -51,5 +51,7 @@ def test_links_and_commands_lead_somewhere(path):
         assert link.startswith("http") or (path.parent / link).exists(), link
     for module in re.findall(r"python -m (milx[\w.]*)", text):
         assert importlib.util.find_spec(module), module
+    for file, name in re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", text):
+        assert f"def {name}(" in (DOCS.parent / file).read_text(), f"{file}::{name}"
     for script in re.findall(r"python (experiments/\S+\.py)", text):
         assert (DOCS.parent / script).is_file(), script

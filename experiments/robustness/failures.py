@@ -131,13 +131,21 @@ class Outcome(NamedTuple):
     result: dict[str, Any]
 
 
+def _heed_signals() -> None:
+    """Lets a new process heed signals that this one may have been told to ignore, for example by `nohup`."""
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
+
+
 def begin(folder: pathlib.Path, at: int = 0, kind: str = "") -> Outcome:
     """Lives in a process of its own."""
     command = [sys.executable, __file__, f"--life={folder}", f"--at={at}", f"--kind={kind}"]
     began = time.perf_counter()
     environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(folder.parent / "programs")}
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=DEADLINE, env=environment, check=False)
+        done = subprocess.run(
+            command, capture_output=True, text=True, timeout=DEADLINE, env=environment, preexec_fn=_heed_signals
+        )
     except subprocess.TimeoutExpired:
         return Outcome(-1000, DEADLINE, "", "", {})
     result: dict[str, Any] = {}

@@ -80,7 +80,7 @@ def export(policy: Policy, out: str | pathlib.Path, shots: int = 1) -> None:
         files.write_arrays(partial / "params.npz", arrays, compress=False)
         digests = {path.name: files.sha256(path) for path in sorted(partial.iterdir())}
         files.write_json(partial / "policy.json", {"format": standalone.FORMAT, "inputs": sizes, "sha256": digests})
-        files.write_bytes(partial / "policy.py", pathlib.Path(standalone.__file__).read_bytes())
+        files.write_bytes(partial / "policy.py", files.read_bytes(pathlib.Path(standalone.__file__).resolve()))
 
 
 def input_shapes(policy: Policy, shots: int) -> dict[str, dict[str, list[int]]]:

@@ -22,7 +22,7 @@ def names() -> list[str]:
 
 def result(name: str) -> dict[str, Any]:
     """Reads a policy's result: its run's evaluation.json, and `pytrees.fingerprint` of its parameters."""
-    return files.read_json(FOLDER / name / "result.json")
+    return files.read_json(_path(name, "result.json"))
 
 
 def load(run: str | pathlib.Path) -> Policy:
@@ -48,11 +48,10 @@ def load(run: str | pathlib.Path) -> Policy:
     config = assemble.from_dict(reached["config"])
     spec = envs.make(config.env_name, config.env.image_shape, config.env.action_cost).spec
     method = methods.make(config, spec)
-    params = pytrees.read(FOLDER / run / "params.npz", like=params_like(method, spec))
+    path = _path(str(run), "params.npz")
+    params = pytrees.read(path, like=params_like(method, spec))
     if pytrees.fingerprint(params) != reached["params_hash"]:
-        raise files.FileError(
-            f"{FOLDER / run / 'params.npz'}: has changed, expected the parameters that ship with milx"
-        )
+        raise files.FileError(f"{path}: has changed, expected the parameters that ship with milx")
     return Policy(method, spec, params, config)
 
 
@@ -67,3 +66,8 @@ def save(trained: Policy, reached: dict[str, Any], folder: pathlib.Path) -> None
     pytrees.write(folder / "params.npz", trained.params)
     digest = pytrees.fingerprint(trained.params)
     files.write_json(folder / "result.json", reached | {"params_hash": digest})
+
+
+def _path(name: str, file: str) -> pathlib.Path:
+    """Finds a file of a policy; some package managers install links."""
+    return (FOLDER / name / file).resolve()
