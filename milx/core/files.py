@@ -6,6 +6,7 @@ beside them: a process holds a lock on its temporary files for as long as it liv
 """
 
 import contextlib
+import errno
 import fcntl
 import hashlib
 import io
@@ -26,6 +27,8 @@ MAX_BYTES = 1 << 33
 """The most that is read at once, in bytes. A larger file is refused before memory is allocated for it."""
 MAX_JSON_BYTES = 1 << 26
 _PARTIAL = ".partial"
+_NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
+"""How a file system without locks answers; leftovers stay there."""
 
 
 class FileError(ValueError):
@@ -122,7 +125,8 @@ def locked(path: pathlib.Path) -> Iterator[None]:
     """Holds the lock file at `path`; it is free again when this process has ended, however it ended.
 
     Raises:
-        FileError: if another process holds it (the message says which), or it cannot be written.
+        FileError: if another process holds it (the message says which), it cannot be written, or the file system has no
+            locks.
     """
     with _failing(path, "written"):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -130,9 +134,13 @@ def locked(path: pathlib.Path) -> Iterator[None]:
     with file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
+        except BlockingIOError as error:
             file.seek(0)
-            raise FileError(f"{path.parent}: is in use by {file.read(200).strip()}, expected no other") from error
+            raise FileError(
+                f"{path.parent}: is in use by {file.read(200).strip()}, expected no other process"
+            ) from error
+        except OSError as error:
+            raise FileError(f"{path}: cannot be locked, expected a file system with locks: {error.strerror}") from error
         with _failing(path, "written"):
             file.truncate(0)
             file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
@@ -266,7 +274,9 @@ def _claim(path: pathlib.Path, *, is_folder: bool) -> tuple[pathlib.Path, int]:
             return partial, _lock(partial)
         except (FileNotFoundError, BlockingIOError):  # another process took it for a leftover
             continue
-        except OSError:
+        except OSError as error:
+            if error.errno in _NO_LOCKS:
+                return partial, os.open(partial, os.O_RDONLY)
             partial.rmdir() if is_folder else partial.unlink()
             raise
 

@@ -36,7 +36,9 @@ class MetricsWriter:
         with self._reported("TensorBoard's events"):
             self._events = EventsWriter(str(folder / "events"), f".{step}")
             # TensorBoard drops what an interrupted run wrote from this step on.
-            self._events.write_event(Event(step=step + 1, session_log=SessionLog(status=SessionLog.START)))
+            self._events.write_event(
+                Event(step=step + 1, wall_time=time.time(), session_log=SessionLog(status=SessionLog.START))
+            )
 
     def write(self, step: int, values: dict[str, float]) -> None:
         """Writes one line."""

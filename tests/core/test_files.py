@@ -148,6 +148,21 @@ def test_a_lock_is_held_by_one_process_and_is_free_when_it_has_died(tmp_path):
         pass
 
 
+def test_without_locks_files_are_written_and_leftovers_stay(tmp_path, monkeypatch):
+    """Writes on a file system that has no locks, as some networks' have none; a run needs them."""
+
+    def flock(*_):
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr(files.fcntl, "flock", flock)
+    (tmp_path / ".other.0.partial").write_text("")
+    files.write_json(tmp_path / "file", 1)
+    assert files.read_json(tmp_path / "file") == 1
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".other.0.partial", "file"]
+    with pytest.raises(FileError, match=r"lock: cannot be locked, expected a file system with locks: No locks"):
+        files.locked(tmp_path / "lock").__enter__()
+
+
 def test_a_folder_appears_whole_or_not_at_all(tmp_path):
     with pytest.raises(ZeroDivisionError), files.creating(tmp_path / "set") as partial:
         (partial / "file").write_text("a")
