@@ -30,13 +30,6 @@ from absl import app, flags, logging
 
 KINDS = ("ENOSPC", "SIGKILL", "EIO", "SIGTERM", "full", "SIGINT", "SIGHUP")
 FLAGS = flags.FLAGS
-flags.DEFINE_list("kinds", list(KINDS), "What happens; with several, each operation gets the next one.")
-flags.DEFINE_integer("every", 1, "Only every so many operations.", lower_bound=1)
-flags.DEFINE_integer("processes", 2, "Lives at once.", lower_bound=1)
-flags.DEFINE_string("out", None, "The JSON file; default experiments/results/robustness/failures-cpu.json.")
-flags.DEFINE_string("life", None, "Folder of a life to live, in place of all the above.")
-flags.DEFINE_integer("at", 0, "With --life: the operation at which it is disturbed; 0 for none.")
-flags.DEFINE_string("kind", "", "With --life: by what.")
 DEADLINE = 120
 """Seconds in which a life must have ended, disturbed or not."""
 _EVENTS = {"open": 0, "os.rename": 0, "os.mkdir": 0, "os.remove": 0, "os.rmdir": 0, "os.truncate": 0, "os.link": 0}
@@ -221,4 +214,11 @@ def main(_: list[str]) -> None:
 
 
 if __name__ == "__main__":
+    flags.DEFINE_list("kinds", list(KINDS), "What happens; with several, each operation gets the next one.")
+    flags.DEFINE_integer("every", 1, "Only every so many operations.", lower_bound=1)
+    flags.DEFINE_integer("processes", 2, "Lives at once.", lower_bound=1)
+    flags.DEFINE_string("out", None, "The JSON file; default experiments/results/robustness/failures-cpu.json.")
+    flags.DEFINE_string("life", None, "Folder of a life to live, in place of all the above.")
+    flags.DEFINE_integer("at", 0, "With --life: the operation at which it is disturbed; 0 for none.")
+    flags.DEFINE_string("kind", "", "With --life: by what.")
     app.run(main)
