@@ -12,7 +12,7 @@ from absl import app, flags, logging
 from milx.config import assemble
 from milx.config.registry import load_plugins
 from milx.core import platform
-from milx.core.messages import fail
+from milx.core.commands import command
 from milx.training.factory import make_run
 
 _WORKDIR = flags.DEFINE_string("workdir", None, "Folder of the run.", required=True)
@@ -26,14 +26,12 @@ def main(argv: list[str]) -> None:
     platform.configure()
     load_plugins()
     path = pathlib.Path(_WORKDIR.value) / "config.json"
-    if not path.is_file():
-        fail(f"workdir: {path.parent} has no config.json, expected a folder of `python -m milx.train`")
-    try:
+    with command():
+        if not path.is_file():
+            raise ValueError(f"workdir: {path.parent} has no config.json, expected a folder of `python -m milx.train`")
         platform.require_device()
         run = make_run(assemble.read(path), path.parent)
         run.report(run.evaluate())
-    except (ValueError, OSError) as error:
-        fail(error)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ import pathlib
 from absl import app, flags, logging
 
 from milx.core import platform
-from milx.core.messages import fail
+from milx.core.commands import command
 from milx.deploy.export import export
 from milx.deploy.pretrained import load
 
@@ -19,13 +19,11 @@ def main(argv: list[str]) -> None:
         raise app.UsageError("expected two arguments, RUN and OUT")
     logging.set_verbosity(logging.WARNING)
     platform.configure()
-    try:
+    with command():
         platform.require_device()
         export(load(argv[1]), argv[2], flags.FLAGS.shots)
-    except (ValueError, OSError) as error:
-        fail(error)
-    size = sum(path.stat().st_size for path in pathlib.Path(argv[2]).iterdir())
-    print(f"{argv[2]}: {size / 1e6:.1f} MB. To load it, use `from policy import Policy` in that folder.")
+        size = sum(path.stat().st_size for path in pathlib.Path(argv[2]).iterdir())
+        print(f"{argv[2]}: {size / 1e6:.1f} MB. To load it, use `from policy import Policy` in that folder.")
 
 
 if __name__ == "__main__":

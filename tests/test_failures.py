@@ -35,4 +35,8 @@ def test_what_goes_wrong_is_noticed():
     assert failures.wrong(good, good, "EIO", "b")[0] == "ended well with other parameters"
     assert failures.wrong(good, silent, "EIO", "a")[0].startswith("begun again, it ended with 1")
     assert failures.wrong(silent, good, "EIO", "a") == ["no message, or a traceback in its place"]
+    loud = silent._replace(errors="milx: a checkpoint was damaged\nTraceback (most recent call last):\nKeyError: 1\n")
+    assert failures.wrong(loud, good, "EIO", "a") == ["no message, or a traceback in its place"]
+    told = silent._replace(errors="milx: a disk is full\n")
+    assert failures.wrong(told, good, "EIO", "a") == []
     assert failures.wrong(silent, good, "SIGTERM", "a")[0] == "exit code 1, expected 143"

@@ -23,12 +23,12 @@ from milx import envs, methods
 from milx.config import assemble
 from milx.config.assemble import make_config
 from milx.config.schema import Config
-from milx.core import files, pytrees
+from milx.core import files, pytrees, signals
 from milx.core.checkpoint import Checkpoints
 from milx.data import simulated as demos_lib
 from milx.data.simulated import DemoSet
 from milx.evaluation import closed_loop, listening, provenance, results
-from milx.training import loop, signals
+from milx.training import loop
 from milx.training.metrics import MetricsWriter, read_metrics
 from milx.training.simulated import demos_of_split, result_of, training_on, trial_key, validation_of
 from milx.training.state import Training, check_steps, initial_state, restore_state, save_state

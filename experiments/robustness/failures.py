@@ -4,14 +4,16 @@
     python experiments/robustness/failures.py --every=1 --kinds=SIGKILL
 
 A life imports demonstrations, trains, validates and writes checkpoints, evaluates, exports and loads. In a process of
-its own it is disturbed once, at the n-th operation on a file that Python makes in its folder. It has to end within the
-deadline, with the right exit code and a message; what it has left must be whole; and the same life, begun again, must
-end with the parameters of the one that was not disturbed.
+its own it is disturbed once, at the n-th operation on a file that Python makes in its folder: opening, synchronizing,
+locking, renaming, removing, or making a folder. It has to end within the deadline, with the right exit code and a
+message; what it has left must be whole; and the same life, begun again, must end with the parameters of the one that
+was not disturbed.
 """
 
 import concurrent.futures
 import contextlib
 import errno
+import fcntl
 import itertools
 import json
 import os
@@ -22,6 +24,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import h5py
@@ -57,8 +60,19 @@ def disturb(folder: pathlib.Path, at: int, kind: str) -> list[int]:
     count, inside = [0], f"{folder.resolve()}{os.sep}"
 
     def audit(event: str, arguments: tuple) -> None:
-        if event not in _EVENTS or not isinstance(path := arguments[_EVENTS[event]], str | bytes | os.PathLike):
-            return
+        if event in _EVENTS and isinstance(path := arguments[_EVENTS[event]], str | bytes | os.PathLike):
+            begins(path)
+
+    def watched(function: Callable[..., Any]) -> Callable[..., Any]:
+        """Watches a function without an audit event, whose first argument is an open file."""
+
+        def call(file: Any, *arguments: Any) -> Any:
+            begins(pathlib.Path(f"/proc/self/fd/{file if isinstance(file, int) else file.fileno()}").readlink())
+            return function(file, *arguments)
+
+        return call
+
+    def begins(path: str | bytes | os.PathLike) -> None:
         if not os.path.abspath(os.fsdecode(path)).startswith(inside):  # noqa: PTH100
             return
         count[0] += 1
@@ -74,43 +88,40 @@ def disturb(folder: pathlib.Path, at: int, kind: str) -> list[int]:
             raise OSError(number, os.strerror(number), path)
 
     sys.addaudithook(audit)
+    os.fsync, fcntl.flock = watched(os.fsync), watched(fcntl.flock)
     return count
 
 
 def live(folder: pathlib.Path, at: int, kind: str) -> None:
     """Lives a life, or goes on with one, and prints its result as JSON."""
     import milx
-    from milx.core import pytrees
-    from milx.core.messages import fail
+    from milx.core import commands, pytrees
     from milx.data import episodes
     from milx.data.robomimic import Robomimic
     from milx.deploy import standalone
     from milx.deploy.export import export
-    from milx.training import recorded, signals
+    from milx.training import recorded
     from milx.training.factory import make_run
 
     logging.set_verbosity(logging.ERROR)  # as the launchers do
     milx.configure()
     count = disturb(folder, at, kind)
-    try:
-        with signals.Stop().listen():
-            if not (folder / "set").exists():
-                source = Robomimic(folder.parent / "demos.hdf5", "", "robot", "actions", 8)
-                found = source.episodes(str(folder.parent / "tasks.json"))
-                episodes.write(folder / "set", found, source.sizes, (0.2, 0.2), "a recording")
-            config = recorded.config_for(folder / "set", preset="cpu")
-            config.recorded.horizon, config.network.fc_layers = 6, (8,)
-            config.train.meta_batch, config.train.log_every, config.train.eval_every = 2, 2, 4
-            config.train.steps = 8
-            run = make_run(config, folder / "run")
-            run.train()
-            run.evaluate()
-            if not (folder / "exported").exists():
-                export(milx.load(folder / "run"), folder / "exported")
-            standalone.Policy(folder / "exported")
-            params = milx.load(folder / "run").params
-    except (ValueError, OSError) as error:
-        fail(error)
+    with commands.command():
+        if not (folder / "set").exists():
+            source = Robomimic(folder.parent / "demos.hdf5", "", "robot", "actions", 8)
+            found = source.episodes(str(folder.parent / "tasks.json"))
+            episodes.write(folder / "set", found, source.sizes, (0.2, 0.2), "a recording")
+        config = recorded.config_for(folder / "set", preset="cpu")
+        config.recorded.horizon, config.network.fc_layers = 6, (8,)
+        config.train.meta_batch, config.train.log_every, config.train.eval_every = 2, 2, 4
+        config.train.steps = 8
+        run = make_run(config, folder / "run")
+        run.train()
+        run.evaluate()
+        if not (folder / "exported").exists():
+            export(milx.load(folder / "run"), folder / "exported")
+        standalone.Policy(folder / "exported")
+        params = milx.load(folder / "run").params
     print(json.dumps({"params": pytrees.fingerprint(params), "operations": count[0]}))
 
 
@@ -153,7 +164,8 @@ def wrong(disturbed: Outcome, again: Outcome, kind: str, params: str) -> list[st
     found = []
     if disturbed.code not in allowed:
         found.append(f"exit code {disturbed.code}, expected {' or '.join(map(str, allowed))}")
-    if disturbed.code == 1 and not any(line.startswith("milx: ") for line in disturbed.errors.splitlines()):
+    lines = disturbed.errors.splitlines()
+    if disturbed.code == 1 and ("Traceback" in disturbed.errors or not any(line[:6] == "milx: " for line in lines)):
         found.append("no message, or a traceback in its place")
     if disturbed.code == 0 and disturbed.result.get("params") != params:
         found.append("ended well with other parameters")

@@ -7,7 +7,6 @@ to `damaged/` beside the folder of checkpoints. Nothing is lost, and checkpoints
 import contextlib
 import pathlib
 import shutil
-import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -21,6 +20,7 @@ from orbax.checkpoint import checkpoint_managers as policies
 
 from milx.core import files, parallel
 from milx.core.files import FileError
+from milx.core.messages import warn
 
 UNVALIDATED = -1e9
 """The score of a checkpoint that has not been validated: it is the best one only if there is no other."""
@@ -28,10 +28,6 @@ FORMAT = 1
 """The number of what `Checkpoints.save` writes."""
 _CHECKSUMS = "checksums.json"
 _METADATA = "_CHECKPOINT_METADATA"
-
-
-def _to_stderr(message: str) -> None:
-    print(f"milx: {message}", file=sys.stderr, flush=True)
 
 
 class Checkpoints:
@@ -46,7 +42,7 @@ class Checkpoints:
         ValueError: if there are checkpoints and all of them are damaged.
     """
 
-    def __init__(self, folder: pathlib.Path, read_only: bool = False, report: Callable[[str], None] = _to_stderr):
+    def __init__(self, folder: pathlib.Path, read_only: bool = False, report: Callable[[str], None] = warn):
         self.folder, self._read_only, self._report = folder.absolute(), read_only, report
         self._view: tempfile.TemporaryDirectory | None = None
         self._manager = self._open(self._without_damaged())
@@ -117,8 +113,11 @@ class Checkpoints:
             expected = f"what this version of milx writes; it is of {self._origin(step)}"
             raise FileError(f"{self.folder / str(step)}: cannot be restored, expected {expected} ({reason})") from error
         extra = restored["extra"]
-        if not isinstance(extra, dict) or extra.pop("format", 1) != FORMAT:  # the first had no number
-            raise FileError(f"{self.folder / str(step)}: expected format {FORMAT}: made by a later milx")
+        if not isinstance(extra, dict):
+            raise FileError(f"{self.folder / str(step)}: extra: got {extra!r:.100}, expected values by name")
+        if (number := extra.pop("format", 1)) != FORMAT:  # the first had no number
+            got = f"got format {number!r:.100}, expected {FORMAT}"
+            raise FileError(f"{self.folder / str(step)}: {got}: it may have been made by a later milx")
         # Orbax commits arrays to a device. Programs that were compiled for uncommitted arrays would be compiled again.
         free = lambda like, x: jnp.asarray(np.asarray(x) if like.size else np.zeros(like.shape, like.dtype))  # noqa: E731
         return {name: jax.tree.map(free, like[name], restored[name]) for name in like}, extra
@@ -131,12 +130,11 @@ class Checkpoints:
         copied = True
         if parallel.is_first_host():
             copy = self._replaced / str(step)
-            partial = copy.with_suffix(".partial")
             try:
-                shutil.rmtree(partial, ignore_errors=True)
-                shutil.copytree(self.folder / str(step), partial)
-                partial.rename(copy)
-            except OSError as error:
+                files.remove(copy)
+                with files.creating(copy) as partial:
+                    shutil.copytree(self.folder / str(step), partial, dirs_exist_ok=True)
+            except (FileError, shutil.Error) as error:
                 copied = False
                 self._report(f"checkpoint of step {step} could not be written again: {error}")
         if not parallel.on_all_hosts(copied):
@@ -144,7 +142,10 @@ class Checkpoints:
         self._manager.delete(step)
         written = self.save(step, items, score, extra)
         if parallel.is_first_host():
-            self._put_back()
+            if written:
+                self._forget(copy)
+            else:
+                self._put_back()
         parallel.wait_for_all()
         if not written:
             self._manager = self._open(self.folder)
@@ -188,15 +189,23 @@ class Checkpoints:
 
     def _put_back(self) -> None:
         """Finishes a `replace`: moves copies of missing or damaged checkpoints back and deletes all others."""
-        for copy in self._replaced.glob("*"):
+        files.remove_leftovers(self._replaced)
+        for copy in self._replaced.glob("[0-9]*"):
             target = self.folder / copy.name
-            if copy.suffix or (target.is_dir() and not _damage(target)):
-                shutil.rmtree(copy)
+            if target.is_dir() and not _damage(target):
+                self._forget(copy)
                 continue
             if target.is_dir():
                 _move_aside(target)
-            copy.rename(target)
-        with contextlib.suppress(OSError):  # the folder does not exist or cannot be removed
+            files.move(copy, target)
+        with contextlib.suppress(OSError):  # the folder does not exist or is not empty
+            self._replaced.rmdir()
+
+    def _forget(self, copy: pathlib.Path) -> None:
+        """Removes a copy that is no longer needed."""
+        with contextlib.suppress(FileError):  # the next start tries again
+            files.remove(copy)
+        with contextlib.suppress(OSError):
             self._replaced.rmdir()
 
     def _without_damaged(self) -> pathlib.Path:
@@ -251,45 +260,47 @@ def _stored(x: Any) -> Any:
 
 
 def _damage(checkpoint: pathlib.Path) -> str | None:
-    """Describes what is wrong with a checkpoint's files; returns None if they are undamaged."""
-    path = checkpoint / _CHECKSUMS
+    """Describes what is wrong with a checkpoint's files; returns None if they are undamaged.
+
+    Raises:
+        FileError: if they cannot be read now, which says nothing about what they hold.
+    """
     if not (checkpoint / _METADATA).is_file():
         return f"{_METADATA} is missing"
-    if not path.is_file():
-        return _unreadable(checkpoint)
     try:
-        expected = dict(files.read_json(path))
-    except (ValueError, TypeError):
-        return f"{_CHECKSUMS} holds no checksums"
-    try:
-        found = _checksums(checkpoint)
+        files.refuse_links(checkpoint)
+        problem = _changed(checkpoint) if (checkpoint / _CHECKSUMS).is_file() else _unreadable(checkpoint)
+        return problem or _bad_score(checkpoint)
     except FileError as error:
+        if isinstance(error.__cause__, OSError) and not isinstance(error.__cause__, FileNotFoundError):
+            raise
         return str(error)
+
+
+def _changed(checkpoint: pathlib.Path) -> str | None:
+    """Describes where a checkpoint does not match its checksums; returns None if it does."""
+    expected = files.read_json(checkpoint / _CHECKSUMS)
+    if not isinstance(expected, dict):
+        return f"{_CHECKSUMS} holds no checksums"
+    found = _checksums(checkpoint)
     for name in sorted(expected):
         if name not in found:
             return f"{name} is missing"
         if found[name] != expected[name]:
             return f"{name} has changed"
-    return _bad_score(checkpoint) if expected else f"{_CHECKSUMS} is empty"
+    return None if expected else f"{_CHECKSUMS} is empty"
 
 
 def _bad_score(checkpoint: pathlib.Path) -> str | None:
     """Describes what is wrong with the score by which Orbax ranks a checkpoint; returns None if it is a number."""
-    try:
-        values = files.read_json(checkpoint / "metrics" / "metrics")
-    except FileError as error:
-        return str(error)
+    values = files.read_json(checkpoint / "metrics" / "metrics")
     score = values.get("success") if isinstance(values, dict) else None
     return None if isinstance(score, int | float) and abs(score) < 1e30 else f"its score is {score!r:.100}, no number"
 
 
 def _unreadable(checkpoint: pathlib.Path) -> str | None:
     """Describes why a checkpoint without checksums cannot be read; returns None if it can."""
-    for path in (checkpoint / "metrics" / "metrics", checkpoint / "extra" / "metadata"):
-        try:
-            files.read_json(path)
-        except FileError as error:
-            return f"{path.relative_to(checkpoint)} cannot be read ({error})"
+    files.read_json(checkpoint / "extra" / "metadata")
     with contextlib.closing(ocp.StandardCheckpointer()) as reader:
         for item in sorted(path.parent for path in checkpoint.glob("*/manifest.ocdbt")):
             try:
@@ -310,8 +321,7 @@ def _write_checksums(checkpoint: pathlib.Path) -> None:
 
 def _move_aside(checkpoint: pathlib.Path) -> None:
     aside = checkpoint.parent.parent / "damaged"
-    aside.mkdir(exist_ok=True)
     target, number = aside / checkpoint.name, 1
     while target.exists():
         target, number = aside / f"{checkpoint.name}.{number}", number + 1
-    checkpoint.rename(target)
+    files.move(checkpoint, target)

@@ -6,13 +6,13 @@ beside them: a process holds a lock on its temporary files for as long as it liv
 """
 
 import contextlib
-import errno
 import fcntl
 import hashlib
 import io
 import json
 import os
 import pathlib
+import re
 import secrets
 import shutil
 import socket
@@ -26,9 +26,8 @@ import numpy as np
 MAX_BYTES = 1 << 33
 """The most that is read at once, in bytes. A larger file is refused before memory is allocated for it."""
 MAX_JSON_BYTES = 1 << 26
-_PARTIAL = ".partial"
-_NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
-"""How a file system without locks answers; leftovers stay there."""
+_LEFTOVER = re.compile(r"\..+\.[0-9a-f]{16}\.partial")
+"""The names of temporary files and folders."""
 
 
 class FileError(ValueError):
@@ -60,10 +59,16 @@ def append(path: pathlib.Path, text: str) -> None:
     """Appends to a file, which is made if it is missing. A process that is killed may leave a part of the text.
 
     Raises:
-        FileError: if it cannot be written.
+        FileError: if it cannot be written; the file keeps what it held before.
     """
-    with _failing(path, "written"), path.open("a") as file:
-        file.write(text)
+    with _failing(path, "written"), path.open("ab", buffering=0) as file:
+        end, content = file.seek(0, os.SEEK_END), text.encode()
+        try:
+            while content:
+                content = content[file.write(content) :]
+        except OSError:
+            file.truncate(end)
+            raise
 
 
 def read_bytes(path: pathlib.Path, at_most: int = MAX_BYTES) -> bytes:
@@ -130,21 +135,19 @@ def locked(path: pathlib.Path) -> Iterator[None]:
     """
     with _failing(path, "written"):
         path.parent.mkdir(parents=True, exist_ok=True)
-        file = path.open("a+")
+        file = path.open("ab+", buffering=0)
     with file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             file.seek(0)
-            raise FileError(
-                f"{path.parent}: is in use by {file.read(200).strip()}, expected no other process"
-            ) from error
+            holder = file.read(200).decode(errors="replace").strip()
+            raise FileError(f"{path.parent}: is in use by {holder}, expected no other process") from error
         except OSError as error:
             raise FileError(f"{path}: cannot be locked, expected a file system with locks: {error.strerror}") from error
         with _failing(path, "written"):
             file.truncate(0)
-            file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
-            file.flush()
+            file.write(f"process {os.getpid()} on {socket.gethostname()}\n".encode())
         yield
 
 
@@ -195,13 +198,38 @@ def creating(folder: pathlib.Path) -> Iterator[pathlib.Path]:
 
 def remove_leftovers(folder: pathlib.Path) -> None:
     """Removes temporary files and folders whose processes have ended."""
-    for path in folder.glob(f".*{_PARTIAL}"):
-        with contextlib.suppress(OSError):  # another process removes it, or uses it
-            lock = _lock(path)
-            try:
-                shutil.rmtree(path) if path.is_dir() else path.unlink()
-            finally:
-                os.close(lock)
+    for path in folder.glob(".*.partial"):
+        if _LEFTOVER.fullmatch(path.name):
+            with contextlib.suppress(OSError):  # another process removes it, or uses it
+                lock = _lock(path)
+                try:
+                    shutil.rmtree(path) if path.is_dir() else path.unlink()
+                finally:
+                    os.close(lock)
+
+
+def remove(path: pathlib.Path) -> None:
+    """Removes a file, or a folder with all it holds; one that is not there need not be removed.
+
+    Raises:
+        FileError: if it cannot be removed.
+    """
+    with _failing(path, "removed"), contextlib.suppress(FileNotFoundError):
+        shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
+
+
+def move(path: pathlib.Path, target: pathlib.Path) -> None:
+    """Renames a file or a folder.
+
+    Raises:
+        FileError: if something is there already, or it cannot be renamed.
+    """
+    with _failing(target, "written"):
+        if os.path.lexists(target):
+            raise FileError(f"{target}: exists, expected nothing there: nothing is written over")
+        target.parent.mkdir(parents=True, exist_ok=True)
+        path.rename(target)
+        _synchronize(target.parent)
 
 
 def inside(root: pathlib.Path, path: str | pathlib.Path) -> pathlib.Path:
@@ -229,17 +257,23 @@ def inside(root: pathlib.Path, path: str | pathlib.Path) -> pathlib.Path:
 
 
 def refuse_links(folder: pathlib.Path) -> None:
-    """Checks that nothing in a folder, at any depth, is a link.
+    """Checks that a folder is no link and holds files and folders alone, at any depth: no link, no pipe, no device.
 
     Raises:
-        FileError: if something is, or the folder cannot be read.
+        FileError: if it holds something else, or cannot be read.
     """
-    with _failing(folder, "read"), os.scandir(folder) as entries:
-        for entry in entries:
-            if entry.is_symlink():
-                raise FileError(f"{entry.path}: is a link, expected a file or a folder: links are not followed")
-            if entry.is_dir():
-                refuse_links(pathlib.Path(entry.path))
+    if folder.is_symlink():
+        raise FileError(f"{folder}: is a link, expected a folder: links are not followed")
+    waiting = [str(folder)]
+    with _failing(folder, "read"):
+        while waiting:
+            with os.scandir(waiting.pop()) as entries:
+                for entry in entries:
+                    if entry.is_dir(follow_symlinks=False):
+                        waiting.append(entry.path)
+                    elif not entry.is_file(follow_symlinks=False):
+                        kind = "a link" if entry.is_symlink() else "no file"
+                        raise FileError(f"{entry.path}: is {kind}, expected a file or a folder: links are not followed")
 
 
 @contextlib.contextmanager
@@ -250,7 +284,7 @@ def _opened(path: pathlib.Path, at_most: int) -> Iterator[Any]:
         with os.fdopen(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK), "rb") as file:
             found = os.fstat(file.fileno())
             if not stat.S_ISREG(found.st_mode):
-                raise FileError(f"{path}: expected a file")
+                raise FileError(f"{path}: is no file, expected one: folders, pipes and devices are not read")
             if found.st_size > at_most:
                 raise FileError(f"{path}: got {found.st_size} bytes, expected at most {at_most}")
             yield file
@@ -268,17 +302,18 @@ def _failing(path: pathlib.Path, doing: str) -> Iterator[None]:
 def _claim(path: pathlib.Path, *, is_folder: bool) -> tuple[pathlib.Path, int]:
     """Makes an empty temporary file or folder beside `path` and locks it; returns it and the lock's descriptor."""
     while True:
-        partial = path.with_name(f".{path.name[:100]}.{secrets.token_hex(8)}{_PARTIAL}")
+        partial = path.with_name(f".{path.name[:100]}.{secrets.token_hex(8)}.partial")
         partial.mkdir() if is_folder else partial.touch(exist_ok=False)
         try:
             return partial, _lock(partial)
         except (FileNotFoundError, BlockingIOError):  # another process took it for a leftover
             continue
-        except OSError as error:
-            if error.errno in _NO_LOCKS:
+        except OSError:
+            try:  # a file system may have no locks, or none for folders: leftovers stay there
                 return partial, os.open(partial, os.O_RDONLY)
-            partial.rmdir() if is_folder else partial.unlink()
-            raise
+            except OSError:
+                partial.rmdir() if is_folder else partial.unlink()
+                raise
 
 
 def _lock(path: pathlib.Path) -> int:
@@ -287,7 +322,9 @@ def _lock(path: pathlib.Path) -> int:
     Raises:
         OSError: if another process has locked it or removed it.
     """
-    descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
+    # NFS locks only what is open for writing.
+    mode = os.O_RDONLY if path.is_dir() else os.O_RDWR
+    descriptor = os.open(path, mode | os.O_NOFOLLOW | os.O_NONBLOCK)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         if path.stat().st_ino != os.fstat(descriptor).st_ino:

@@ -2,7 +2,6 @@
 
 import hashlib
 import pathlib
-import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -12,6 +11,7 @@ import numpy as np
 
 from milx.core import files, parallel
 from milx.core.files import FileError
+from milx.core.messages import warn
 
 
 def leaves(tree: Any) -> dict[str, Any]:
@@ -81,10 +81,10 @@ def kept(path: pathlib.Path, make: Callable[[], Any], like: Callable[[], Any]) -
         try:
             return read(path, like())
         except FileError as error:
-            print(f"milx: what it holds is made again: {error}", file=sys.stderr)
+            warn(f"{error}; its contents are made again")
     tree = make()
     try:
         write(path, tree)
     except FileError as error:
-        print(f"milx: what has been made is not kept: {error}", file=sys.stderr)
+        warn(f"{error}; its contents are used, but not kept")
     return tree

@@ -5,7 +5,8 @@ from absl import app
 from rich.console import Console
 from rich.table import Table
 
-from milx.core.messages import fail, printable
+from milx.core.commands import command
+from milx.core.messages import printable
 from milx.data.dataset import DataSet, check_size
 from milx.methods.whitening import MIN_STD
 from milx.types import SPLITS
@@ -71,7 +72,7 @@ def describe(data: DataSet, console: Console) -> None:
     head = data.header
     lengths = [length for task in head.tasks for length in task.lengths]
     console.print(
-        f"{data.folder}: {len(head.tasks)} tasks, {len(lengths)} demonstrations, "
+        f"{printable(str(data.folder))}: {len(head.tasks)} tasks, {len(lengths)} demonstrations, "
         f"from {printable(head.source) or 'unknown'}"
     )
     image = "no images" if head.image_shape is None else f"images {head.image_shape[0]} x {head.image_shape[1]}"
@@ -96,17 +97,15 @@ def main(argv: list[str]) -> None:
     """Prints what a data set holds, and its problems."""
     if len(argv) != 2:
         raise app.UsageError("expected one argument, PATH")
-    console = Console(markup=False)  # the names of tasks may look like markup
-    try:
+    with command():
+        console = Console(markup=False)  # the names of tasks may look like markup
         data = DataSet(argv[1])
         describe(data, console)
         found = problems(data)
-    except (ValueError, OSError) as error:
-        fail(error)
-    for problem in found:
-        console.print(f"- {problem}")
-    if not found:
-        console.print("nothing seems wrong")
+        for problem in found:
+            console.print(f"- {printable(problem)}")
+        if not found:
+            console.print("nothing seems wrong")
 
 
 if __name__ == "__main__":

@@ -111,14 +111,17 @@ class Writer:
     def __enter__(self) -> "Writer":
         """Starts from nothing; what an earlier attempt left unfinished is removed."""
         self._partial = self._stack.enter_context(files.creating(self.folder))
+        self._stack.push(self._write_header)
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *error: Any) -> None:
         """Puts the folder in its place, or removes what was written if something went wrong."""
+        self._stack.__exit__(kind, *error)
+
+    def _write_header(self, kind: type[BaseException] | None, *_: Any) -> None:
         if kind is None:
             header = dataclasses.replace(self._header, tasks=tuple(self._tasks))
             _write_group(self._partial, {"milx": {"version": VERSION, **dataclasses.asdict(header)}})
-        self._stack.__exit__(kind, *error)
 
     def add(self, name: str, split: str, lengths: list[int], demos: Iterable[Demo]) -> None:
         """Writes a task.
@@ -223,7 +226,7 @@ class DataSet:
         try:
             return future.result()
         except ValueError as error:  # a chunk is missing, or does not fit its checksum
-            raise ValueError(f"{self.folder}: a chunk is damaged, expected what was written: {error}") from error
+            raise FileError(f"{self.folder}: a chunk is damaged, expected what was written: {error}") from error
 
     def _array(self, task: int, field: str) -> Any:
         key = (task, field)
@@ -231,20 +234,18 @@ class DataSet:
             path = self.folder / f"{task:05d}" / field
             shape, dtype = _fields(self.header)[field]
             expected = (sum(self.header.tasks[task].lengths), *shape)
-            if path.parent.is_symlink() or path.is_symlink():
-                raise FileError(f"{path}: is reached through a link, expected none: links are not followed")
-            files.refuse_links(path)
+            files.refuse_links(path.parent)
             spec = {"driver": "zarr3", "kvstore": _kvstore(path), "fill_missing_data_reads": False}
             try:
                 array = ts.open(spec, open=True, read=True).result()
             except ValueError as error:
-                raise ValueError(f"{path}: cannot be opened, expected an array of zarr: {error}") from error
+                raise FileError(f"{path}: cannot be opened, expected an array of zarr: {error}") from error
             if array.shape != expected or array.dtype.numpy_dtype != dtype:
                 got = f"{array.dtype.name} {list(array.shape)}"
-                raise ValueError(f"{path}: got {got}, expected {np.dtype(dtype).name} {list(expected)}")
+                raise FileError(f"{path}: got {got}, expected {np.dtype(dtype).name} {list(expected)}")
             chunk = [n or 1 for n in array.chunk_layout.read_chunk.shape or ()]
             if math.prod(chunk) * np.dtype(dtype).itemsize > _MAX_CHUNK_BYTES:
-                raise ValueError(f"{path}: got chunks of {chunk}, expected at most {_MAX_CHUNK_BYTES >> 20} MiB")
+                raise FileError(f"{path}: got chunks of {chunk}, expected at most {_MAX_CHUNK_BYTES >> 20} MiB")
             self._arrays[key] = array
         return self._arrays[key]
 

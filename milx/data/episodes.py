@@ -11,8 +11,8 @@ from PIL import Image
 from rich.progress import track
 
 from milx.core import files
+from milx.core.commands import command
 from milx.core.files import FileError
-from milx.core.messages import fail
 from milx.data.dataset import Writer
 from milx.types import Demo
 
@@ -76,12 +76,10 @@ def run(argv: list[str], open_source: Callable[[str, Any], Source]) -> None:
     """
     if len(argv) != 3:
         raise app.UsageError("expected two arguments, PATH and OUT")
-    try:
+    with command():
         source = open_source(argv[1], FLAGS)
         write(argv[2], source.episodes(FLAGS.task), source.sizes, (FLAGS.validation, FLAGS.test), argv[1])
-    except (ValueError, OSError) as error:
-        fail(error)
-    print(f"{argv[2]}: look at it with `python -m milx.data.check {argv[2]}`")
+        print(f"{argv[2]}: look at it with `python -m milx.data.check {argv[2]}`")
 
 
 def write(

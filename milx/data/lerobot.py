@@ -203,7 +203,8 @@ def read_video(file: pathlib.Path, start: float, count: int, fps: float) -> Iter
         raise ValueError("reading videos needs the package av: install milx with the extra 'lerobot'") from error
     wanted = 0
     try:
-        with av.open(str(file), format="mp4") as container:
+        # A path such as "file:/etc/x.mp4" would be a protocol of FFmpeg's if it were not absolute.
+        with av.open(str(file.absolute()), format="mp4") as container:
             stream = container.streams.video[0]
             stream.thread_type = "AUTO"
             container.seek(int(start * av.time_base))

@@ -6,7 +6,6 @@ import hashlib
 import itertools
 import json
 import pathlib
-import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -16,8 +15,9 @@ import mujoco
 import numpy as np
 
 from milx.config.schema import DataConfig, TrainConfig
-from milx.core import pytrees
+from milx.core import files, pytrees
 from milx.core.batching import map_in_chunks
+from milx.core.messages import warn
 from milx.data.goals import goals
 from milx.envs.base import Env, State, Task
 from milx.trajopt import expert
@@ -90,7 +90,7 @@ def collect(
     success, _ = map_in_chunks(functools.partial(judge, env), (each, states), config.plan_batch)
     demos, diverged = _arrange(tasks, states, action, success)
     if diverged:
-        print(f"milx: {diverged} of {len(action)} demonstrations diverged and are dropped", file=sys.stderr)
+        warn(f"{diverged} of {len(action)} demonstrations diverged and are dropped")
     return demos
 
 
@@ -267,6 +267,7 @@ def cached(
     parts = folder / f"{path.stem}.part-{config.plan_batch}"
     make = functools.partial(collect, env, jax.random.key(seed), split, num_tasks, num_demos, config, parts)
     demos = pytrees.kept(path, make, lambda: shapes(env, num_tasks, num_demos))
-    for part in folder.glob(f"{parts.name}-*.npz"):
-        part.unlink(missing_ok=True)
+    if path.is_file():  # or the parts are all that is kept
+        for part in folder.glob(f"{parts.name}-*.npz"):
+            files.remove(part)
     return demos

@@ -1,13 +1,13 @@
 """Policies that ship with milx: `milx.load("push")`."""
 
 import pathlib
-import sys
 from typing import Any
 
 from milx import envs, methods
 from milx.config import assemble
 from milx.config.registry import load_plugins
 from milx.core import files, pytrees
+from milx.core.messages import warn
 from milx.deploy import policy
 from milx.deploy.policy import Policy
 from milx.methods import params_like
@@ -37,11 +37,11 @@ def load(run: str | pathlib.Path) -> Policy:
     """
     load_plugins()  # a run may be of another package's method or environment
     is_run = (pathlib.Path(run) / "config.json").is_file()
-    if is_run and run in names():
-        print(f"milx: loading the run in ./{run}, not the policy {run!r} that ships with milx", file=sys.stderr)
-    if is_run or (pathlib.Path(run).exists() and run not in names()):
+    if is_run and str(run) in names():
+        warn(f"loading the run in ./{run}, not the policy {str(run)!r} that ships with milx")
+    if is_run or (pathlib.Path(run).exists() and str(run) not in names()):
         return policy.load_run(run)
-    if run not in names():
+    if str(run) not in names():
         expected = f"the folder of a run, or one of {', '.join(names())}, which ship with milx"
         raise ValueError(f"run: got {str(run)!r}, expected {expected}")
     reached = result(str(run))

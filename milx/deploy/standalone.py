@@ -48,7 +48,10 @@ class Policy:
                 [jnp.asarray(arrays[name]) for name in sorted(arrays) if name.startswith("memory") == of_memory]
                 for of_memory in (False, True)
             )
-        self._adapt, self._act = (jax.jit(jax.export.deserialize(bytearray(program)).call) for program in programs)
+        exported = [jax.export.deserialize(bytearray(program)) for program in programs]
+        for name, program, after in zip(("adapt", "act"), exported, (0, len(self.initial_memory)), strict=True):
+            _check_inputs(folder / "policy.json", name, self.sizes[name], program.in_avals, after)
+        self._adapt, self._act = (jax.jit(program.call) for program in exported)
 
     def adapt(self, **demo: np.ndarray) -> list[jax.Array]:
         """Adapts to a task from one demonstration, or from several of the same length.
@@ -136,6 +139,14 @@ class Policy:
         return checked
 
 
+def _check_inputs(path: pathlib.Path, name: str, fields: dict, takes: tuple, after: int) -> None:
+    """Raises ValueError if the shapes of a program's fields are not those that it takes; `after` inputs follow them."""
+    takes = takes[-len(fields) - after :]
+    named = {field: list(aval.shape) for field, aval in zip(sorted(fields), takes, strict=False)}
+    if named != fields:
+        raise ValueError(f"{path}: {name}: got {fields}, expected {named}, which the program takes")
+
+
 def _read_header(path: pathlib.Path) -> tuple[dict, dict]:
     """Reads the shapes of the inputs, and the SHA-256 of the other files by name."""
     try:
@@ -143,8 +154,10 @@ def _read_header(path: pathlib.Path) -> tuple[dict, dict]:
         if values["format"] != FORMAT:
             raise ValueError(f"format: got {values['format']!r}, expected {FORMAT}")
         inputs, digests = values["inputs"], values["sha256"]
-        if not isinstance(inputs, dict) or not isinstance(digests, dict):
-            raise ValueError("inputs and sha256: expected objects")
+        if set(inputs) != {"adapt", "act"} or not all(isinstance(fields, dict) for fields in inputs.values()):
+            raise ValueError(f"inputs: got {inputs!r:.100}, expected the fields of adapt and of act")
+        if not isinstance(digests, dict):
+            raise ValueError(f"sha256: got {digests!r:.100}, expected hashes by the names of files")
         return inputs, digests
     except (KeyError, TypeError, ValueError, RecursionError) as error:
         raise ValueError(f"{path}: expected what the export of a policy writes: {error!r:.200}") from error

@@ -13,12 +13,12 @@ from ml_collections import config_flags
 from milx.config import assemble
 from milx.config.registry import DURATIONS, PRESETS, load_plugins
 from milx.config.schema import Config
-from milx.core import parallel, platform
-from milx.core.messages import fail
+from milx.core import commands, parallel, platform
+from milx.core.messages import fail, say
 from milx.data import RECORDED
 from milx.envs import ENVS
 from milx.methods import METHODS
-from milx.training import recorded, signals
+from milx.training import recorded
 
 FLAGS = flags.FLAGS
 _OWN_FLAGS = {"env_name": "env", "method_name": "method", "preset": "preset", "seed": "seed"}
@@ -70,13 +70,10 @@ def run(main: Callable[[Config, str], None]) -> None:
         config = FLAGS.config
         what = config.env_name if FLAGS.data is None else pathlib.Path(FLAGS.data).resolve().name
         workdir = FLAGS.workdir or f"runs/{what}-{config.method_name}-{config.preset}-{config.seed}"
-        if parallel.is_first_host():
-            print(_describe(config, what, workdir), flush=True)
-        try:
-            with signals.Stop().listen():
-                main(config, workdir)
-        except (ValueError, OSError) as error:
-            fail(error)
+        with commands.command():
+            if parallel.is_first_host():
+                say(_describe(config, what, workdir))
+            main(config, workdir)
 
     app.run(start, flags_parser=parse_or_exit)
 
@@ -94,7 +91,7 @@ def _describe(config: Config, what: str, workdir: str) -> str:
     duration = DURATIONS.get(config.env_name, {}).get(config.preset)
     if duration and config.method_name == "mil" and not assemble.overrides(config):
         said.append(f"This took {duration}.")
-    return "milx: " + " ".join(said)
+    return " ".join(said)
 
 
 def parse(argv: Sequence[str], values: flags.FlagValues = FLAGS) -> list[str]:

@@ -8,10 +8,9 @@ from typing import Any, NamedTuple
 import jax
 
 from milx.config.schema import TrainConfig
-from milx.core import parallel
+from milx.core import parallel, signals
 from milx.core.checkpoint import UNVALIDATED, Checkpoints
-from milx.training import signals
-from milx.training.state import Training
+from milx.training.state import PARTS, Training
 from milx.training.update import TrainState
 
 MOST_IN_VAIN = 100
@@ -40,7 +39,7 @@ class Clock:
     """Wall-clock by part, in s: "demos", "compile", "train", "evaluate", and the "total" since it was made."""
 
     def __init__(self) -> None:
-        self.seconds = dict.fromkeys(("demos", "compile", "train", "evaluate", "total"), 0.0)
+        self.seconds = dict.fromkeys(PARTS, 0.0)
         self._began = time.perf_counter()
 
     @contextlib.contextmanager

@@ -73,4 +73,4 @@ def read_metrics(path: pathlib.Path) -> list[dict[str, Any]]:
     for line in files.read_bytes(path).splitlines():
         with contextlib.suppress(ValueError, RecursionError):
             lines.append(json.loads(line))
-    return [line for line in lines if isinstance(line, dict) and "step" in line]
+    return [line for line in lines if isinstance(line, dict) and isinstance(line.get("step"), int)]

@@ -60,6 +60,8 @@ LARGEST = 1e12
 
 MIN_ERROR = 1e-9
 """An error of the mean action, in squared standard deviations, below which nothing is to be learned."""
+MAX_RATIO = 1e6
+"""The largest ratio of two errors: a score must stay above that of a checkpoint without one."""
 
 
 class Statistics(NamedTuple):
@@ -256,4 +258,4 @@ class RecordedRun(Run):
 
 def _relative(errors: dict[str, float], name: str) -> float:
     """Divides an error by that of the mean action, which is zero if all actions of the held-out tasks are the same."""
-    return errors[name] / max(errors["mean_action"], MIN_ERROR)
+    return min(errors[name] / max(errors["mean_action"], MIN_ERROR), MAX_RATIO)

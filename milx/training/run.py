@@ -24,13 +24,13 @@ from rich.console import Console
 from milx import methods
 from milx.config import assemble
 from milx.config.schema import Config, ConvConfig
-from milx.core import files, parallel, progress
+from milx.core import files, parallel, progress, signals
 from milx.core.checkpoint import UNVALIDATED, Checkpoints
-from milx.core.messages import printable
+from milx.core.messages import printable, say
 from milx.evaluation import listening, results
 from milx.methods import params_like
 from milx.networks import fixed_filters
-from milx.training import loop, signals
+from milx.training import loop
 from milx.training.metrics import MetricsWriter
 from milx.training.state import Training, check_steps, initial_state, parse_extra, restore_state, save_state
 from milx.training.update import Sample, Trainer, TrainState, compile_in_background, make_optimizer
@@ -145,7 +145,7 @@ class Run(abc.ABC):
                 hooks = self._hooks(metrics, training.dataset_hash)
                 state = loop.fit(scan, state, key, training, config, checkpoints, hooks, self.clock, stop)
         if parallel.on_any_host(bool(stop.asked)):
-            print(f"milx: stopped at step {int(state.step)}; the same command goes on from there", flush=True)
+            say(f"stopped at step {int(state.step)}; the same command goes on from there")
             raise SystemExit(stop.exit_code)
 
     def phase(self, description: str, total: int | None = None, done: int = 0) -> AbstractContextManager[None]:

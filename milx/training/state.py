@@ -15,6 +15,9 @@ from milx.methods.whitening import Whitening
 from milx.networks import fixed_filters
 from milx.training.update import Trainer, TrainState
 
+PARTS = ("demos", "compile", "train", "evaluate", "total")
+"""The parts of a run whose seconds are counted."""
+
 
 class Training(NamedTuple):
     """What a run trains on.
@@ -114,6 +117,7 @@ def parse_extra(checkpoints: Checkpoints, step: int, extra: dict[str, Any]) -> t
         raise FileError(
             f"{checkpoints.folder / str(step)}: expected the run's dataset_hash and seconds beside the arrays"
         )
-    if not all(isinstance(value, int | float) for value in seconds.values()):
-        raise FileError(f"{checkpoints.folder / str(step)}: seconds: got {seconds!r:.200}, expected numbers")
+    if set(seconds) != set(PARTS) or not all(isinstance(value, int | float) for value in seconds.values()):
+        expected = f"numbers: {', '.join(PARTS)}"
+        raise FileError(f"{checkpoints.folder / str(step)}: seconds: got {seconds!r:.200}, expected {expected}")
     return digest, seconds

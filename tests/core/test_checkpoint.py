@@ -2,6 +2,7 @@
 
 import errno
 import json
+import os
 import pathlib
 import resource
 import signal
@@ -143,6 +144,37 @@ def test_checkpoints_without_checksums_load(folder, tmp_path):
     assert not reports
 
 
+@pytest.mark.parametrize("error", [errno.EIO, errno.EMFILE, errno.EACCES], ids=errno.errorcode.get)
+def test_what_cannot_be_read_now_is_no_damage(folder, tmp_path, monkeypatch, error):
+    """Fails to read the newest checkpoint: an error, and nothing is moved or passed over."""
+    mine, sha256 = copy(folder, tmp_path / "checkpoints"), checkpoint.files.sha256
+
+    def fail(path):
+        if "20" in path.parts:
+            try:
+                raise OSError(error, os.strerror(error))
+            except OSError as cause:
+                raise checkpoint.FileError(f"{path}: cannot be read: {cause.strerror}") from cause
+        return sha256(path)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoint.files, "sha256", fail)
+        for read_only in (True, False):
+            with pytest.raises(ValueError, match=rf"20/.*: cannot be read: {os.strerror(error)}"):
+                Checkpoints(mine, read_only=read_only, report=print)
+    assert Checkpoints(mine, read_only=True, report=print).latest == 20
+
+
+def test_a_link_in_a_checkpoint_is_damage(folder, tmp_path):
+    """Puts a link in the place of a file; the checksums fit."""
+    mine, reports = copy(folder, tmp_path / "checkpoints"), []
+    path = mine / files(folder)[-1]
+    path.rename(tmp_path / "aside")
+    path.symlink_to(tmp_path / "aside")
+    assert Checkpoints(mine, read_only=True, report=reports.append).latest == 10
+    assert f"{path.name}: is a link, expected a file or a folder" in reports[0]
+
+
 def test_a_truncated_one_without_checksums_is_passed_over(folder, tmp_path):
     mine, reports = copy(folder, tmp_path / "checkpoints"), []
     (mine / "20" / "checksums.json").unlink()
@@ -211,6 +243,15 @@ def test_a_checkpoint_that_is_written_again_is_never_lost(tmp_path, monkeypatch)
     assert restored(checkpoints, checkpoints.latest) == {"number": 2}
     assert checkpoints.score(10) == 0.5
     assert not (tmp_path / "replaced").exists()
+
+    def unreadable(path):
+        raise AssertionError(path)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoint, "_damage", unreadable)
+        assert checkpoints.replace(10, items(10), 0.7, {"number": 3}), "what has just been written is not read again"
+    assert not (tmp_path / "replaced").exists()
+    assert restored(checkpoints, checkpoints.latest) == {"number": 3}
     checkpoints.close()
 
 
@@ -226,7 +267,7 @@ def test_without_checksums_every_file_counts(folder, tmp_path):
         (mine / "20" / "checksums.json").write_text(text)
         reports = []
         assert Checkpoints(mine, read_only=True, report=reports.append).latest == 10
-        assert "checksums.json holds no checksums" in reports[0]
+        assert "checksums.json holds no checksums" in reports[0] or "checksums.json: expected JSON" in reports[0]
 
 
 def test_arrays_without_entries_come_back(tmp_path):
@@ -255,13 +296,17 @@ def test_a_score_that_is_no_number_is_damage(folder, tmp_path, score):
     rewritten(mine, "metrics/metrics", {"success": score})
     assert Checkpoints(mine, read_only=True, report=reports.append).latest == 10
     assert "20 is damaged and not used: its score is" in reports[0]
+    (mine / "20" / "checksums.json").unlink()  # as in a checkpoint of an earlier version
+    assert Checkpoints(mine, read_only=True, report=reports.append).latest == 10
+    assert reports[1] == reports[0]
 
 
 @pytest.mark.parametrize("extra", [3, [], {"format": 2}, {"format": "x"}])
 def test_extra_values_of_another_format_are_refused(folder, tmp_path, extra):
     mine = copy(folder, tmp_path / "checkpoints")
     rewritten(mine, "extra/metadata", extra)
-    with pytest.raises(ValueError, match=r"20: (expected format 1: made by a later milx|cannot be restored)"):
+    expected = r"20: (got format .*, expected 1: it may have been made by a later milx|extra: got|cannot be restored)"
+    with pytest.raises(ValueError, match=expected):
         Checkpoints(mine, read_only=True, report=print).restore(20, LIKE)
 
 

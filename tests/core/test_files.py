@@ -118,8 +118,9 @@ def test_leftovers_of_killed_processes_are_removed_and_those_of_others_are_not(t
     files.write_bytes(tmp_path / "other", b"")
     assert partial.exists(), "its process lives"
     end(process)
+    (tmp_path / ".mine.partial").write_text("another program's")
     files.write_bytes(tmp_path / "other", b"")
-    assert [found.name for found in tmp_path.iterdir()] == ["other"]
+    assert sorted(found.name for found in tmp_path.iterdir()) == [".mine.partial", "other"]
 
 
 def test_two_processes_write_the_same_file(tmp_path):
@@ -155,12 +156,72 @@ def test_without_locks_files_are_written_and_leftovers_stay(tmp_path, monkeypatc
         raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
 
     monkeypatch.setattr(files.fcntl, "flock", flock)
-    (tmp_path / ".other.0.partial").write_text("")
+    (tmp_path / ".other.0123456789abcdef.partial").write_text("")
     files.write_json(tmp_path / "file", 1)
     assert files.read_json(tmp_path / "file") == 1
-    assert sorted(path.name for path in tmp_path.iterdir()) == [".other.0.partial", "file"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".other.0123456789abcdef.partial", "file"]
     with pytest.raises(FileError, match=r"lock: cannot be locked, expected a file system with locks: No locks"):
         files.locked(tmp_path / "lock").__enter__()
+
+
+def test_where_only_what_is_open_for_writing_is_locked_a_file_of_a_living_process_stays(tmp_path, monkeypatch):
+    """Locks as NFS does, which refuses exclusive locks of what is open for reading, and so has none for folders."""
+    flock = files.fcntl.flock
+
+    def nfs(descriptor, operation):
+        if files.fcntl.fcntl(descriptor, files.fcntl.F_GETFL) & os.O_ACCMODE == os.O_RDONLY:
+            raise OSError(errno.EBADF, os.strerror(errno.EBADF))
+        flock(descriptor, operation)
+
+    monkeypatch.setattr(files.fcntl, "flock", nfs)
+    with files.replacing(tmp_path / "one") as partial:
+        files.write_json(tmp_path / "other", 1)
+        partial.write_text("whole")
+    with files.creating(tmp_path / "folder") as partial:
+        files.write_json(tmp_path / "other", 2)
+        (partial / "file").write_text("whole")
+    assert (tmp_path / "one").read_text() == (tmp_path / "folder" / "file").read_text() == "whole"
+    (tmp_path / ".one.0123456789abcdef.partial").write_text("of a process that was killed")
+    files.write_json(tmp_path / "other", 3)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["folder", "one", "other"]
+
+
+def test_a_pipe_in_place_of_a_leftover_keeps_nobody_waiting(tmp_path):
+    os.mkfifo(tmp_path / ".file.0123456789abcdef.partial")
+    files.write_json(tmp_path / "file", 1)
+    assert files.read_json(tmp_path / "file") == 1
+
+
+def test_what_cannot_be_appended_leaves_the_lines_before_and_room_for_those_after(tmp_path):
+    """Limits the size of the file in the middle of a line, as a full disk would, and lifts the limit again."""
+    path = tmp_path / "lines"
+    files.append(path, "first\n")
+    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10, limits[1]))
+    try:
+        with pytest.raises(FileError, match="lines: cannot be written: File too large"):
+            files.append(path, "second\n")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, before)
+    files.append(path, "third\n")
+    assert path.read_text() == "first\nthird\n"
+
+
+def test_what_is_moved_replaces_nothing_and_what_is_removed_is_not_what_links_name(tmp_path):
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "file").write_text(name)
+    with pytest.raises(FileError, match="b: exists, expected nothing there"):
+        files.move(tmp_path / "a", tmp_path / "b")
+    files.move(tmp_path / "a", tmp_path / "c" / "a")
+    assert (tmp_path / "c" / "a" / "file").read_text() == "a"
+    (tmp_path / "link").symlink_to(tmp_path / "b")
+    for name in ("link", "c", "nothing"):
+        files.remove(tmp_path / name)
+    assert [path.name for path in tmp_path.iterdir()] == ["b"]
+    assert (tmp_path / "b" / "file").read_text() == "b"
 
 
 def test_a_folder_appears_whole_or_not_at_all(tmp_path):
@@ -191,6 +252,12 @@ def test_links_are_not_followed(tmp_path):
     assert files.inside(root, "file") == root / "file"
     with pytest.raises(FileError, match=r"(link|out): is a link, expected a file or a folder"):
         files.refuse_links(root)
+    with pytest.raises(FileError, match=r"out: is a link, expected a folder"):
+        files.refuse_links(root / "out")
+    files.refuse_links(root / "inner")
+    os.mkfifo(root / "inner" / "pipe")
+    with pytest.raises(FileError, match=r"inner/pipe: is no file, expected a file or a folder"):
+        files.refuse_links(root / "inner")
 
 
 def test_what_is_too_large_is_refused_before_it_is_read(tmp_path, monkeypatch):
@@ -229,7 +296,7 @@ def test_pickles_are_not_opened(tmp_path):
 def test_what_is_no_file_is_refused(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     for name in ("pipe", ".", "nothing"):
-        with pytest.raises(FileError, match=r"expected a file|cannot be read: (Is a directory|No such file)"):
+        with pytest.raises(FileError, match=r"is no file, expected one|cannot be read: (Is a directory|No such file)"):
             files.read_bytes(tmp_path / name)
 
 

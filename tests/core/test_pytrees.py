@@ -33,7 +33,8 @@ def test_a_pytree_that_cannot_be_kept_is_returned_and_reported(tmp_path, monkeyp
     monkeypatch.setattr(files, "write_arrays", full)
     made = pytrees.kept(tmp_path / "tree.npz", lambda: TREE, lambda: TREE)
     assert pytrees.fingerprint(made) == pytrees.fingerprint(TREE)
-    assert "not kept: tree.npz: cannot be written: No space left on device" in capsys.readouterr().err
+    expected = "milx: tree.npz: cannot be written: No space left on device; its contents are used, but not kept\n"
+    assert capsys.readouterr().err == expected
 
 
 KEEP = """

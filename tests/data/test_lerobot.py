@@ -212,6 +212,20 @@ def test_a_playlist_in_place_of_a_video_is_not_played(copy):
         open_set(copy).episodes("task_index")[0].read()
 
 
+def test_a_path_is_no_protocol(copy, monkeypatch):
+    """Opens a video of the data set by a path that FFmpeg would take for another file's if it were not absolute."""
+    inside, outside = sorted(copy.glob(f"videos/{TOP}/**/*.mp4"))[0], copy.parent / "outside.mp4"
+    outside.write_bytes(b"no video")
+    monkeypatch.chdir(copy)
+    path = pathlib.Path(f"file:{outside}")
+    path.parent.mkdir(parents=True)
+    shutil.copy(inside, path)
+    frames = [next(lerobot.read_video(video, 0.0, 1, make_lerobot.FPS)) for video in (path, inside)]
+    np.testing.assert_array_equal(*frames)
+    with pytest.raises(ValueError, match="expected a video"):
+        next(lerobot.read_video(outside, 0.0, 1, make_lerobot.FPS))
+
+
 def test_images_are_png_or_jpeg(copy):
     """Shows PostScript and BMP, for which Pillow has readers, too; the first one starts Ghostscript."""
     postscript = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n"

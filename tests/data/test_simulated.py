@@ -149,7 +149,9 @@ def test_planning_that_was_killed_goes_on_with_the_next_part(trained, tmp_path, 
     parts[1].write_bytes(parts[1].read_bytes()[:1000])
     assert_equal(demos_lib.cached(*arguments), trained.train)
     assert len(calls) == 3 + 2, "the second part again, and the third"
-    assert f"what it holds is made again: {parts[1]}: expected an .npz file" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert f"milx: {parts[1]}: expected an .npz file" in said
+    assert said.endswith("its contents are made again\n")
     assert len(list(tmp_path.iterdir())) == 1, "the parts are gone"
 
 

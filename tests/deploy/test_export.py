@@ -144,6 +144,12 @@ def test_a_file_that_is_not_the_exported_one_is_refused(tmp_path):
         (folder / "policy.json").write_text(json.dumps(values | change))
         with pytest.raises(ValueError, match=r"policy\.json: expected what the export of a policy writes"):
             standalone.Policy(folder)
+    for program in ("adapt", "act"):
+        inputs = json.loads(json.dumps(values["inputs"]))
+        inputs[program]["state"][-1] += 1
+        (folder / "policy.json").write_text(json.dumps(values | {"inputs": inputs}))
+        with pytest.raises(ValueError, match=rf"policy\.json: {program}: got .*, expected .* which the program takes"):
+            standalone.Policy(folder)
 
 
 def test_an_exported_policy_never_returns_what_is_not_finite(tmp_path):

@@ -1,17 +1,22 @@
 """The command line: help, and bad input that ends with a message instead of a traceback."""
 
+import importlib
+import json
 import multiprocessing
 import os
 import pathlib
 import re
 import runpy
+import signal
 import subprocess
 import sys
+import time
 import types
 
 import pytest
 from absl import flags
 
+from milx.config import assemble
 from milx.config.assemble import make_config
 from milx.data import RECORDED
 from milx.training import command_line
@@ -179,3 +184,38 @@ def test_an_odd_environment_ends_with_a_message(tmp_path, variables, message):
     assert "Traceback" not in done.stderr
     assert message in done.stderr.splitlines()[-1]
     assert not (tmp_path / "run").exists()
+
+
+def stopped(name, function, arguments):
+    """Calls `main` of a launcher that gets SIGTERM when it calls one of its functions."""
+
+    def wait(*_):
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(60)
+
+    module = importlib.import_module(name)
+    setattr(module, function, wait)
+    if hasattr(module, "shared"):
+        module.shared.define_flags(state="", action="", task="")
+    flags.FLAGS(["milx", *(argument for argument in arguments if argument.startswith("--"))])
+    module.main(["milx", *(argument for argument in arguments if not argument.startswith("--"))])
+
+
+@pytest.mark.parametrize(
+    ("name", "function", "arguments"),
+    [
+        ("milx.evaluate", "make_run", ["--workdir=run"]),
+        ("milx.export", "load", ["run", "out"]),
+        ("milx.data.check", "DataSet", ["set"]),
+        ("milx.data.robomimic", "Robomimic", ["file", "out"]),
+        ("milx.data.lerobot", "LeRobot", ["folder", "out"]),
+    ],
+)
+def test_every_launcher_ends_by_a_signal_with_its_exit_code(forks, tmp_path, monkeypatch, name, function, arguments):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "config.json").write_text(json.dumps(assemble.to_dict(make_config("reach_state"))))
+    process = forks.Process(target=stopped, args=(name, function, arguments))
+    process.start()
+    process.join(60)
+    assert process.exitcode == 143

@@ -8,6 +8,8 @@ import sys
 import threading
 from collections.abc import Iterator
 
+from milx.core.messages import say
+
 _SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 """The signals that tell a run to stop."""
 
@@ -81,9 +83,9 @@ class Stop:
         again, self.asked = self.asked, self.asked or number
         if self._deferred and not (again and number == signal.SIGINT):
             if number == signal.SIGINT and not _is_interactive():
-                print("milx: stopping after the updates under way; Ctrl-C again ends at once", flush=True)
+                say("stopping after the updates under way; Ctrl-C again ends at once")
         elif number != signal.SIGINT or not _is_interactive():
-            print("milx: stopped; the same command goes on", flush=True)
+            say("stopped; the same command goes on")
             # Threads that compile would keep a process alive that ends in the usual way.
             os._exit(128 + number)
 

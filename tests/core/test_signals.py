@@ -1,5 +1,7 @@
 """A process that is told to stop."""
 
+import os
+import pty
 import signal
 import subprocess
 import sys
@@ -25,7 +27,7 @@ NUMBERS = pytest.mark.parametrize("number", SIGNALS, ids=lambda number: number.n
 def test_the_signal_is_noted_where_it_is_deferred_and_what_was_there_before_comes_back(number):
     program = """
     import os, signal, sys, time
-    from milx.training import signals
+    from milx.core import signals
     number = int(sys.argv[1])
     before, stop = signal.getsignal(number), signals.Stop()
     with stop.listen(), stop.deferred():
@@ -48,7 +50,7 @@ def test_elsewhere_the_signal_ends_the_process_at_once_with_its_exit_code(number
     program = """
     import threading, time
     import jax, jax.numpy as jnp
-    from milx.training import signals
+    from milx.core import signals
     count = jax.jit(lambda n: jax.lax.fori_loop(0, n, lambda i, x: jnp.sin(x), 1.0)).lower(1).compile()
     stop = signals.Stop()
     with stop.listen():
@@ -69,7 +71,7 @@ def test_elsewhere_the_signal_ends_the_process_at_once_with_its_exit_code(number
 def test_a_second_interrupt_ends_the_process_at_once_even_where_the_first_is_deferred():
     program = """
     import time
-    from milx.training import signals
+    from milx.core import signals
     stop = signals.Stop()
     with stop.listen(), stop.deferred():
         print("ready", flush=True)
@@ -89,11 +91,59 @@ def test_a_second_interrupt_ends_the_process_at_once_even_where_the_first_is_def
     assert process.returncode == 130
 
 
+@pytest.mark.parametrize("deferred", ["stop.deferred()", "contextlib.nullcontext()"])
+def test_a_terminal_that_closes_stops_the_process_in_order(deferred):
+    """Closes the terminal that a process writes to: SIGHUP comes, and nothing can be printed any more."""
+    program = f"""
+    import contextlib, os, sys, time
+    from milx.core import commands, signals
+    stop = signals.Stop()
+    with commands.command(), stop.listen(), {deferred}:
+        print("ready", flush=True)
+        for _ in range(100):
+            print("working", flush=True)
+            print("working", file=sys.stderr, flush=True)
+            time.sleep(0.1)
+            if stop.asked:
+                print("stopped in order")
+                sys.exit(stop.exit_code + 100)
+    """
+    command = [sys.executable, "-c", textwrap.dedent(program)]
+    pid, terminal = pty.fork()
+    if pid == 0:
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
+        os.execv(command[0], command)
+    said = b""
+    while b"ready" not in said:
+        said += os.read(terminal, 100)
+    os.close(terminal)
+    _, status = os.waitpid(pid, 0)
+    assert os.waitstatus_to_exitcode(status) == (229 if "stop" in deferred else 129)
+
+
+def test_a_closed_pipe_does_not_end_a_command():
+    """Reads one line of a process and closes the pipe; the process goes on to its end."""
+    program = """
+    import sys, time
+    from milx.core import commands
+    with commands.command():
+        print("ready", flush=True)
+        for _ in range(20):
+            time.sleep(0.05)
+            print("x" * 10_000)
+        sys.exit(7)
+    """
+    process = start(program)
+    assert process.stdout.readline() == "ready\n"
+    process.stdout.close()
+    assert process.wait() == 7
+
+
 def test_signals_that_were_ignored_stay_ignored():
     """As SIGHUP is under nohup."""
     program = """
     import os, signal, time
-    from milx.training import signals
+    from milx.core import signals
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     stop = signals.Stop()
     with stop.listen():
@@ -109,7 +159,7 @@ def test_signals_that_were_ignored_stay_ignored():
 def test_in_an_interactive_session_an_interrupt_leaves_the_process_alive():
     program = """
     import os, signal, sys, time
-    from milx.training import signals
+    from milx.core import signals
     sys.ps1 = "> "
     try:
         with signals.Stop().listen():
