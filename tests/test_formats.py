@@ -81,7 +81,7 @@ def test_a_shipped_policy_is_loaded_and_its_parameters_are_those_that_were_writt
     assert policy.config == make_config("reach_state", preset="cpu")
 
 
-def test_a_later_version_is_refused_by_its_number(tmp_path):
+def test_a_later_version_is_refused_by_its_number(tmp_path, monkeypatch):
     """Raises the number of every format by one; each is refused with its name and both numbers."""
     folder = shutil.copytree(make_golden.GOLDEN / milx.__version__, tmp_path / "golden")
 
@@ -90,13 +90,15 @@ def test_a_later_version_is_refused_by_its_number(tmp_path):
         group = values
         for part in path[:-1]:
             group = group[part]
-        group[path[-1]] += 1
+        group[path[-1]] = group.get(path[-1], 1) + 1
         (folder / name).write_text(json.dumps(values))
 
     raised("run/config.json", "config_version")
     raised("run/spec.json", "spec_version")
     raised("set/zarr.json", "attributes", "milx", "version")
     raised("exported/policy.json", "format")
+    raised("shipped/small/result.json", "format")
+    monkeypatch.setattr(pretrained, "FOLDER", folder / "shipped")
     raised("run/checkpoints/10/extra/metadata", "format")
     (folder / "run/checkpoints/10/checksums.json").unlink()
     like = {"params": milx.load(make_golden.GOLDEN / milx.__version__ / "run").params}
@@ -105,6 +107,7 @@ def test_a_later_version_is_refused_by_its_number(tmp_path):
         (lambda: read_spec(folder / "run/spec.json"), "spec_version: got 2, expected 1: made by a later milx"),
         (lambda: DataSet(folder / "set"), "version: got 2, expected 1"),
         (lambda: standalone.Policy(folder / "exported"), "format: got 2, expected 1"),
+        (lambda: milx.load("small"), "result.json: got format 2, expected 1: it may be of a later milx"),
         (
             lambda: Checkpoints(folder / "run/checkpoints", read_only=True).restore(10, like),
             "10: got format 2, expected 1: it may have been made by a later milx",

@@ -10,21 +10,23 @@ import multiprocessing
 import pathlib
 import resource
 import shutil
-import sys
 import traceback
 
 import numpy as np
 import pytest
+from absl import logging
 from PIL import Image
 
 from milx.config import assemble
 from milx.config.assemble import make_config
 from milx.core import files
+from milx.core.checkpoint import Checkpoints
 from milx.data import lerobot
 from milx.data.dataset import DataSet, Writer
 from milx.data.lerobot import LeRobot
 from milx.data.robomimic import Robomimic
-from milx.deploy import policy
+from milx.deploy import policy, standalone
+from milx.training.state import parse_extra
 from milx.types import Demo, Spec
 
 FIXTURES = pathlib.Path(__file__).parent / "fixtures"
@@ -97,20 +99,31 @@ def read_json(folder):
         read(folder / name)
 
 
+def copied(*parts):
+    """Returns a function that copies a folder of the fixtures."""
+    return lambda folder: shutil.copytree(FIXTURES.joinpath(*parts), folder, dirs_exist_ok=True)
+
+
+def write_checkpoint(folder):
+    """Copies a checkpoint without its checksums, so that what is damaged reaches the libraries that read it."""
+    copied("golden", "0.1.0", "run", "checkpoints")(folder)
+    for path in folder.glob("*/checksums.json"):
+        path.unlink()
+
+
+def read_checkpoint(folder):
+    checkpoints = Checkpoints(folder, read_only=True, report=lambda _: None)
+    _, extra = checkpoints.restore(checkpoints.latest, {})
+    parse_extra(checkpoints, checkpoints.latest, extra)
+    checkpoints.score(checkpoints.latest)
+
+
 KINDS = {
     "hdf5": (lambda folder: shutil.copy(FIXTURES / "robomimic" / "stack.hdf5", folder), read_robomimic, "*.hdf5", 600),
-    "parquet": (
-        lambda folder: shutil.copytree(FIXTURES / "lerobot", folder, dirs_exist_ok=True),
-        read_lerobot,
-        "**/*.parquet",
-        150,
-    ),
-    "mp4": (
-        lambda folder: shutil.copytree(FIXTURES / "lerobot", folder, dirs_exist_ok=True),
-        read_lerobot,
-        "**/*.mp4",
-        150,
-    ),
+    "parquet": (copied("lerobot"), read_lerobot, "**/*.parquet", 150),
+    "mp4": (copied("lerobot"), read_lerobot, "**/*.mp4", 150),
+    "export": (copied("golden", "0.1.0", "exported"), standalone.Policy, "*", 150),
+    "checkpoint": (write_checkpoint, read_checkpoint, "**/*", 150),
     "images": (write_images, read_images, "*", 500),
     "zarr": (write_data_set, read_data_set, "**/*", 300),
     "npz": (
@@ -129,7 +142,7 @@ def fuzz(kind, folder, report):
     make, read, pattern, times = KINDS[kind]
     with report.open("w") as log:
         faulthandler.enable(log)
-        sys.stderr = log
+        logging.set_verbosity(logging.ERROR)  # as the launchers do
         make(folder)
         read(folder)  # before it is damaged, all is well
         paths = sorted(path for path in folder.glob(pattern) if path.is_file())

@@ -76,6 +76,18 @@ _PLATEAU = {
     "at-once-released": ("the released numbers, that expert", _AT_ONCE | RELEASED),
 }
 
+_MUON = {"optimizer.name": "muon"}
+_BEGINNING = _MUON | {"train.frame_exponent": 2.0}
+_TEN = {"train.meta_batch": 16, "train.support_frames": 10, "train.query_frames": 10}
+_SMALL = {
+    "all": ("`paper`'s batches", {}),
+    "all-muon": ("`paper`'s batches, Muon", _MUON),
+    "ten": ("16 tasks of 10 + 10 time steps", _TEN),
+    "ten-muon": ("16 tasks of 10 + 10 time steps, Muon", _TEN | _MUON),
+    "ten-beginning": ("+ more of the beginning", _TEN | _BEGINNING),
+    "ten-at-once": ("+ an expert that moves at once", _TEN | _BEGINNING | _AT_ONCE),
+}
+
 _VIDEO_STATE = {"method.given": "video+state", "network.learned_loss": "linear"}
 _VIDEO = {
     "method.given": "video",
@@ -205,6 +217,10 @@ _RELATIVES = {
 TABLES: dict[str, dict[str, Row]] = {
     "results": _RESULTS,
     "plateau": {name: Row(label, "reach", _SHORT | changes) for name, (label, changes) in _PLATEAU.items()},
+    "small": {
+        name: Row(label, "reach", {"env.image_shape": (32, 40), "train.steps": 12_000} | changes)
+        for name, (label, changes) in _SMALL.items()
+    },
     "baselines": _BASELINES,
     "ladder": _ladder(),
     "relatives": _RELATIVES,

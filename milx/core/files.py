@@ -247,12 +247,14 @@ def inside(root: pathlib.Path, path: str | pathlib.Path) -> pathlib.Path:
     if not within:
         raise FileError(f"{root}: {path} leads out of the folder, expected a path inside")
     if not there:
-        raise FileError(f"{root}: {path} is missing, expected a file")
+        raise FileError(f"{root}: {path} is missing, expected a file there")
     for step in (found, *found.parents):
         if step == root:
             break
         if step.is_symlink():
-            raise FileError(f"{root}: {path} is reached through a link, expected none: links are not followed")
+            raise FileError(
+                f"{root}: {path} is reached through a link, expected a path without links: they are not followed"
+            )
     return found
 
 

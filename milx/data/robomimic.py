@@ -170,7 +170,7 @@ def _check_links(file: Any, name: str) -> None:
         link = at.get(part, getlink=True) if isinstance(at, h5py.Group) else None
         if isinstance(link, h5py.ExternalLink | h5py.SoftLink):
             raise FileError(
-                f"{file.filename}: {name}: {part} is a link out of its group, expected none: it is not followed"
+                f"{file.filename}: {name}: {part} is a link out of its group, expected data inside: it is not followed"
             )
         at = None if link is None else at.get(part)
 

@@ -13,6 +13,8 @@ from milx.deploy.policy import Policy
 from milx.methods import params_like
 
 FOLDER = pathlib.Path(__file__).parent / "weights"
+FORMAT = 1
+"""The number of what `save` writes."""
 
 
 def names() -> list[str]:
@@ -45,6 +47,9 @@ def load(run: str | pathlib.Path) -> Policy:
         expected = f"the folder of a run, or one of {', '.join(names())}, which ship with milx"
         raise ValueError(f"run: got {str(run)!r}, expected {expected}")
     reached = result(str(run))
+    if (number := reached.get("format", 1)) != FORMAT:  # the first had no number
+        got = f"got format {number!r:.100}, expected {FORMAT}"
+        raise files.FileError(f"{_path(str(run), 'result.json')}: {got}: it may be of a later milx")
     config = assemble.from_dict(reached["config"])
     spec = envs.make(config.env_name, config.env.image_shape, config.env.action_cost).spec
     method = methods.make(config, spec)
@@ -65,7 +70,7 @@ def save(trained: Policy, reached: dict[str, Any], folder: pathlib.Path) -> None
     """
     pytrees.write(folder / "params.npz", trained.params)
     digest = pytrees.fingerprint(trained.params)
-    files.write_json(folder / "result.json", reached | {"params_hash": digest})
+    files.write_json(folder / "result.json", reached | {"format": FORMAT, "params_hash": digest})
 
 
 def _path(name: str, file: str) -> pathlib.Path:
