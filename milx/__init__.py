@@ -14,6 +14,7 @@ from milx.deploy.pretrained import load
 from milx.envs import ENVS, make
 from milx.methods import METHODS
 from milx.types import Demo, Observation
+from milx.worlds.evaluate import evaluate_in
 
 __version__ = "0.1.0"
 __all__ = [
@@ -24,6 +25,7 @@ __all__ = [
     "Policy",
     "__version__",
     "configure",
+    "evaluate_in",
     "load",
     "make",
     "register_env",

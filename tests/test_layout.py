@@ -13,6 +13,7 @@ FLOORS = (
     {"methods", "trajopt"},
     {"data"},
     {"evaluation", "deploy", "gym"},
+    {"worlds"},
     {"training", "export", ""},
     {"train", "evaluate", "collect"},
 )

@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import export as jax_export
 
-from milx import envs
 from milx.config.schema import GIVEN
 from milx.core import files
 from milx.data.goals import with_goals
@@ -86,13 +85,12 @@ def export(policy: Policy, out: str | pathlib.Path, shots: int = 1) -> None:
 def input_shapes(policy: Policy, shots: int) -> dict[str, dict[str, list[int]]]:
     """Returns the shapes of the fields that "adapt" and "act" take, by program and field."""
     spec, config = policy.spec, policy.config
-    horizon = config.recorded.horizon if config.recorded.path else envs.ENVS[config.env_name].horizon
     seen = {"state": [spec.state_size]} if spec.state_size else {}
     if spec.image_shape is not None:
         seen["image"] = [*spec.image_shape, 3]
     shown = seen | {"action": [spec.action_size]}
     hidden = {GIVEN[0]: (), GIVEN[1]: ("action",), GIVEN[2]: ("action", "state")}[config.method.given]
-    adapt = {name: [shots, horizon, *shape] for name, shape in shown.items() if name not in hidden}
+    adapt = {name: [shots, policy.horizon, *shape] for name, shape in shown.items() if name not in hidden}
     return {"adapt": adapt, "act": seen}
 
 

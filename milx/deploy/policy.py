@@ -102,6 +102,11 @@ class Policy:
         params = jax.tree.map(np.asarray, self.params)
         return _from_values, (assemble.to_dict(self.config), self.spec.to_dict(), params)
 
+    @property
+    def horizon(self) -> int:
+        """T, the time steps of the demonstrations that it was trained on."""
+        return self.config.recorded.horizon if self.config.recorded.path else envs.ENVS[self.config.env_name].horizon
+
     @functools.cached_property
     def initial_memory(self) -> Memory:
         """The memory at the start of an episode; empty for most policies."""

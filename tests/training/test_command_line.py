@@ -204,7 +204,7 @@ def stopped(name, function, arguments):
 @pytest.mark.parametrize(
     ("name", "function", "arguments"),
     [
-        ("milx.evaluate", "make_run", ["--workdir=run"]),
+        ("milx.evaluate", "make_run", ["run"]),
         ("milx.export", "load", ["run", "out"]),
         ("milx.data.check", "DataSet", ["set"]),
         ("milx.data.robomimic", "Robomimic", ["file", "out"]),

@@ -1,0 +1,94 @@
+"""What acts in all worlds at once: the policy, and controls that tell what its success rests on."""
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from milx.data.dataset import spread
+from milx.deploy.policy import Policy
+from milx.types import Observation, TaskParams
+from milx.worlds.slot import Episode, Outcome, Task
+
+CONTROLS = {
+    "own": "adapted to the task's own demonstration",
+    "same_family": "adapted to another task of the same family",
+    "other_family": "adapted to a task of another family",
+    "unadapted": "not adapted",
+    "replay": "the actions of the demonstration, one after the other",
+    "mean_action": "the mean action of the demonstration",
+    "random": "random actions",
+}
+"""What acts, by name. All but the first are controls."""
+
+
+def other_tasks(tasks: Sequence[Task], number: int) -> dict[str, int]:
+    """Chooses whose demonstrations mislead a policy: the next task of the same family, and of another one."""
+    others = [(number + i) % len(tasks) for i in range(1, len(tasks))]
+    same = [i for i in others if tasks[i].family == tasks[number].family]
+    different = [i for i in others if tasks[i].family != tasks[number].family]
+    return {name: found[0] for name, found in (("same_family", same), ("other_family", different)) if found}
+
+
+class Actor:
+    """What acts in all worlds at once."""
+
+    def __init__(self, policy: Policy, tasks: Sequence[Task], worlds: int):
+        self._policy, self._tasks = policy, tasks
+        self._others = [other_tasks(tasks, number) for number in range(len(tasks))]
+        self._learned: dict[int | None, TaskParams] = {}
+        first = self._learn(0)
+        copies = lambda tree: jax.tree.map(lambda x: jnp.stack([x] * worlds), tree)  # noqa: E731
+        self._task_params, self._memory = copies(first), copies(policy.initial_memory)
+        self._act = jax.jit(jax.vmap(policy.method.act))
+
+    def can(self, control: str, task: int) -> bool:
+        """Tells whether a control exists for a task."""
+        if control in ("same_family", "other_family"):
+            return control in self._others[task]
+        if control == "unadapted":
+            return self._policy.method.unadapted(self._policy.params) is not None
+        return control not in ("replay", "mean_action") or self._tasks[task].demos[0].action is not None
+
+    def assign(self, world: int, episode: Episode) -> None:
+        """Puts what acts in an episode in the place of what has acted in a world."""
+        source = (
+            None if episode.control == "unadapted" else self._others[episode.task].get(episode.control, episode.task)
+        )
+        put = lambda all, one: all.at[world].set(one)  # noqa: E731
+        self._task_params = jax.tree.map(put, self._task_params, self._learn(source))
+        self._memory = jax.tree.map(put, self._memory, self._policy.initial_memory)
+
+    def act(self, observations: list[Observation], outcomes: list[Outcome | None]) -> list[np.ndarray | None]:
+        """Returns an action for every world; None for a random one."""
+        seen = jax.tree.map(lambda *parts: np.stack(parts), *observations)
+        action, self._memory = self._act(self._task_params, seen, self._memory)
+        return [self._chosen(outcome, mine) for outcome, mine in zip(outcomes, np.asarray(action), strict=True)]
+
+    def _chosen(self, outcome: Outcome | None, action: np.ndarray) -> np.ndarray | None:
+        if outcome is None or outcome.episode.control == "random":
+            return None
+        shown = self._tasks[outcome.episode.task].demos[0].action
+        if outcome.episode.control == "replay":
+            return np.asarray(shown[min(outcome.steps, len(shown) - 1)])
+        if outcome.episode.control == "mean_action":
+            return np.mean(shown, axis=0)
+        if not np.isfinite(action).all():
+            raise ValueError(f"action: got {action} in {outcome.episode}, expected finite numbers")
+        return action
+
+    def _learn(self, source: int | None) -> TaskParams:
+        """Adapts to the demonstrations of a task; None for no adaptation."""
+        if source not in self._learned:
+            policy = self._policy
+            if source is None:
+                self._learned[None] = policy.method.unadapted(policy.params)
+            else:
+                demos = [
+                    jax.tree.map(lambda x: np.asarray(x)[spread(len(x), policy.horizon)], demo)
+                    for demo in self._tasks[source].demos
+                ]
+                shown = jax.tree.map(lambda *parts: np.stack(parts), *demos)
+                self._learned[source] = policy.adapt(policy.params, shown)
+        return self._learned[source]

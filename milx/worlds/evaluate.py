@@ -1,0 +1,104 @@
+"""Closed-loop evaluation of a policy in somebody else's world, beside controls that tell what its success rests on."""
+
+import collections
+import functools
+import itertools
+import sys
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+from milx.config.schema import GIVEN
+from milx.core.progress import advance
+from milx.data.dataset import DataSet
+from milx.deploy.policy import Policy
+from milx.worlds.actor import CONTROLS, Actor
+from milx.worlds.client import Client
+from milx.worlds.slot import Episode, Outcome, Slot, Task
+
+
+def tasks_of(data: DataSet, split: str, policy: Policy) -> list[Task]:
+    """Lists the tasks of a split that have as many demonstrations as the policy's run was evaluated with.
+
+    Args:
+        data: the data set; the names of its tasks are those of the world.
+        split: "train", "validation" or "test".
+        policy: what is to be adapted.
+
+    Raises:
+        ValueError: if there is no such task.
+    """
+    shots, needs_action = policy.config.evaluation.shots, policy.config.method.given == GIVEN[0]
+    tasks = []
+    for number in data.header.of_split(split):
+        info = data.header.tasks[number]
+        shown = [i for i, has_action in enumerate(info.has_action) if has_action or not needs_action][:shots]
+        if len(shown) == shots:
+            tasks.append(Task(info.name, "", tuple(data.read(number, i) for i in shown)))
+    if not tasks:
+        raise ValueError(f"data: {data.folder} has no {split} task with {shots} demonstrations, expected at least one")
+    return tasks
+
+
+def evaluate_in(
+    policy: Policy,
+    make: str,
+    tasks: Sequence[Task],
+    *,
+    controls: Sequence[str] = tuple(CONTROLS),
+    episodes: int = 10,
+    seed: int = 0,
+    workers: int = 4,
+    python: str = sys.executable,
+    timeout: float = 60.0,
+    max_steps: int = 1000,
+) -> list[Outcome]:
+    """Runs episodes of every task with the policy and with controls.
+
+    Args:
+        policy: what is evaluated.
+        make: "module:function", as `milx/worlds/worker.py` describes it.
+        tasks: what is to be done.
+        controls: keys of CONTROLS; those that a task does not have, for example because there is no other family, are
+            left out.
+        episodes: of every task and control, with the seeds `seed`, `seed` + 1 and so on, the same for all controls.
+        seed: of the first episode. The world demonstrates with the seed before, modulo 2^31.
+        workers: processes at once.
+        python: the interpreter that runs the world.
+        timeout: seconds that a world may take to answer. One that has not answered is ended, and its episode lost.
+        max_steps: after which an episode ends, if the world does not end it.
+
+    Returns:
+        What became of all episodes, in the order of tasks, controls and seeds.
+
+    Raises:
+        WorldError: if the world cannot be started, or cannot demonstrate a task.
+        ValueError: for a control that does not exist.
+    """
+    if unknown := sorted(set(controls) - set(CONTROLS)):
+        raise ValueError(f"controls: got {unknown[0]!r}, expected some of {', '.join(CONTROLS)}")
+    connect = functools.partial(Client, make, python, timeout)
+    slots = [Slot(connect, policy.spec, max_steps, seed) for _ in range(workers)]
+    try:
+        with ThreadPoolExecutor(workers) as pool:
+            list(pool.map(Slot.connect, slots))
+            tasks = [slots[0].demonstrated(task, (seed - 1) % 2**31) for task in tasks]
+            actor = Actor(policy, tasks, workers)
+            possible = itertools.product(range(len(tasks)), controls, range(episodes))
+            planned = [Episode(control, task, seed + i) for task, control, i in possible if actor.can(control, task)]
+            waiting, outcomes = collections.deque(planned), dict[Episode, Outcome]()
+            while len(outcomes) < len(planned):
+                for number, slot in enumerate(slots):
+                    if slot.outcome is None and waiting:
+                        slot.outcome = Outcome(waiting.popleft())
+                        actor.assign(number, slot.outcome.episode)
+                list(pool.map(lambda slot: slot.begin(tasks), slots))
+                actions = actor.act([slot.observation for slot in slots], [slot.outcome for slot in slots])
+                list(pool.map(Slot.step, slots, actions))
+                for slot in slots:
+                    if slot.outcome is not None and slot.is_over:
+                        outcomes[slot.outcome.episode], slot.outcome = slot.outcome, None
+                        advance(1)
+    finally:
+        for slot in slots:
+            slot.close()
+    return [outcomes[episode] for episode in planned]

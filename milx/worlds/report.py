@@ -1,0 +1,144 @@
+"""Evaluates a run in a world and reports: success by what acted, over all tasks and by family, and a video."""
+
+import pathlib
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from milx.config import assemble
+from milx.config.schema import Config
+from milx.core import files, progress
+from milx.core.messages import printable
+from milx.data.dataset import DataSet
+from milx.deploy.policy import load_run
+from milx.evaluation import provenance
+from milx.evaluation.intervals import wilson_interval
+from milx.evaluation.plots import side_by_side
+from milx.worlds.actor import CONTROLS
+from milx.worlds.evaluate import evaluate_in, tasks_of
+from milx.worlds.slot import Outcome, Task
+
+FILE, VIDEO = "gym.json", "gym.gif"
+"""The files in the run's folder."""
+
+
+def report_on(config: Config, folder: pathlib.Path, make: str, console: Console | None = None, **options: Any) -> None:
+    """Evaluates a run on the test tasks of its data set, prints a table, and writes FILE and VIDEO.
+
+    Args:
+        config: of the run.
+        folder: the run's.
+        make: "module:function", which makes the world.
+        console: where to report.
+        **options: further arguments of `evaluate_in`.
+
+    Raises:
+        ValueError: if the run is not on recorded demonstrations, or as `evaluate_in`.
+    """
+    if not config.recorded.path:
+        raise ValueError(f"gym: {folder} is a run in simulation, expected one on recorded demonstrations (--data)")
+    console, policy = console or Console(), load_run(folder)
+    tasks = tasks_of(DataSet(config.recorded.path), "test", policy)
+    with progress.phase(console, f"acting in {make}"):
+        outcomes = evaluate_in(policy, make, tasks, **options)
+    found = summarize(outcomes, tasks)
+    console.print(table(found))
+    for loss in losses(outcomes, tasks):
+        console.print(f"lost: {printable(loss)}", markup=False, highlight=False)
+    files.write_json(
+        folder / FILE,
+        {
+            "world": make,
+            "criterion": "info['is_success'] or info['success'], at any time and at the end of an episode",
+            "tasks": [task.name for task in tasks],
+            "controls": found,
+            "lost": losses(outcomes, tasks),
+            "config": assemble.to_dict(config),
+        }
+        | provenance.origin(),
+    )
+    filmed = [outcome for outcome in outcomes if outcome.images]
+    if filmed:
+        demos = [np.asarray(tasks[outcome.episode.task].demos[0].image) for outcome in filmed]
+        trials = [np.stack(outcome.images) for outcome in filmed]
+        longest = max(map(len, demos + trials))
+        side_by_side(_same_length(demos, longest), _same_length(trials, longest), folder / VIDEO)
+
+
+def summarize(outcomes: Sequence[Outcome], tasks: Sequence[Task]) -> dict[str, Any]:
+    """Summarizes episodes for a result file.
+
+    Args:
+        outcomes: of `evaluate_in`.
+        tasks: those that it was given.
+
+    Returns:
+        By key of CONTROLS, the number of "episodes", how many were "lost", the success rates at any time ("ever") and
+        at the "end" with their 95% intervals by Wilson, the mean number of "steps", and the same by "families". A lost
+        episode counts as one without success.
+    """
+    found = {}
+    for control in CONTROLS:
+        mine = [outcome for outcome in outcomes if outcome.episode.control == control]
+        if mine:
+            families = sorted({tasks[outcome.episode.task].family for outcome in mine})
+            of = lambda family: [o for o in mine if tasks[o.episode.task].family == family]  # noqa: B023, E731
+            found[control] = _rates(mine) | {"families": {family: _rates(of(family)) for family in families}}
+    return found
+
+
+def _same_length(clips: Sequence[np.ndarray], length: int) -> np.ndarray:
+    """Repeats the last images of clips [T, H, W, 3]."""
+    return np.stack([clip[np.minimum(np.arange(length), len(clip) - 1)] for clip in clips])
+
+
+def _rates(outcomes: Sequence[Outcome]) -> dict[str, Any]:
+    count = len(outcomes)
+    rates: dict[str, Any] = {
+        "episodes": count,
+        "lost": sum(outcome.lost is not None for outcome in outcomes),
+        "steps": sum(outcome.steps for outcome in outcomes) / count,
+    }
+    for name in ("ever", "end"):
+        successes = sum(getattr(outcome, name) for outcome in outcomes)
+        rates[name] = successes / count
+        rates[f"{name}_wilson95"] = wilson_interval(successes, count)
+    return rates
+
+
+def table(found: dict[str, Any]) -> Table:
+    """Draws a summary: a line for everything that acted, a column for every family."""
+    families = list(next(iter(found.values()))["families"])
+    shown = families if len(families) > 1 else []
+    drawn = Table("", "success at any time (95%)", "at the end (95%)", "episodes", *shown, title_justify="left")
+    for control, rates in found.items():
+        lost = f", {rates['lost']} lost" if rates["lost"] else ""
+        drawn.add_row(
+            CONTROLS[control],
+            *(_with_interval(rates, name) for name in ("ever", "end")),
+            f"{rates['episodes']}{lost}",
+            *(_of_family(rates, family) for family in shown),
+        )
+    return drawn
+
+
+def losses(outcomes: Iterable[Outcome], tasks: Sequence[Task]) -> list[str]:
+    """Says of every lost episode why it was lost."""
+    return [
+        f"{tasks[outcome.episode.task].name}, {outcome.episode.control}, seed {outcome.episode.seed}: {outcome.lost}"
+        for outcome in outcomes
+        if outcome.lost is not None
+    ]
+
+
+def _with_interval(rates: dict[str, Any], name: str) -> str:
+    low, high = rates[f"{name}_wilson95"]
+    return f"{rates[name]:.1%} ({low:.1%} to {high:.1%})"
+
+
+def _of_family(rates: dict[str, Any], family: str) -> str:
+    """A control may not exist in a family."""
+    return f"{rates['families'][family]['ever']:.1%}" if family in rates["families"] else ""

@@ -1,0 +1,151 @@
+"""One of the worlds that run side by side, and the episode in it."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from milx.data.episodes import resized, shrunk
+from milx.deploy.policy import check_observation
+from milx.types import Demo, Observation, Spec
+from milx.worlds.client import Client, WorldError
+
+
+class Task(NamedTuple):
+    """A task of a world.
+
+    Attributes:
+        name: what the world's function is called with.
+        family: the kind of task; tasks of one family differ in their goals.
+        demos: what shows the task, [T, ...] each; none if the world itself demonstrates it.
+    """
+
+    name: str
+    family: str = ""
+    demos: tuple[Demo, ...] = ()
+
+
+class Episode(NamedTuple):
+    """An episode to run: what acts, the number of the task, and the seed of the reset."""
+
+    control: str
+    task: int
+    seed: int
+
+
+@dataclasses.dataclass
+class Outcome:
+    """What became of an episode.
+
+    Attributes:
+        episode: which.
+        ever: whether the task was done at any time.
+        end: whether it was done at the end.
+        steps: how many were done.
+        lost: why the episode could not be finished; None if it was. It does not count as a success.
+        images: [H, W, 3] uint8 each, what was seen in a task's first episode after its own demonstrations.
+    """
+
+    episode: Episode
+    ever: bool = False
+    end: bool = False
+    steps: int = 0
+    lost: str | None = None
+    images: list[np.ndarray] = dataclasses.field(default_factory=list)
+
+
+class Slot:
+    """One of the worlds that run side by side, and the episode in it."""
+
+    def __init__(self, connect: Callable[[], Client], spec: Spec, max_steps: int, first_seed: int):
+        self._connect, self._spec, self._max_steps, self._first_seed = connect, spec, max_steps, first_seed
+        self._client: Client | None = None
+        self.outcome: Outcome | None = None
+        self.is_over = True
+        self.observation = _nothing(spec)
+
+    def connect(self) -> None:
+        """Starts the world, if it is not there."""
+        self._client = self._client or self._connect()
+
+    def close(self) -> None:
+        """Ends the world."""
+        if self._client is not None:
+            self._client.close()
+        self._client = None
+
+    def demonstrated(self, task: Task, seed: int) -> Task:
+        """Lets the world demonstrate a task that has no demonstration."""
+        if task.demos:
+            return task
+        assert self._client is not None
+        _, shown = self._client.ask({"do": "demonstrate", "task": task.name, "seed": seed})
+        if "action" not in shown:
+            raise WorldError(f"demonstration of {task.name!r}: got {sorted(shown)}, expected an action, at least")
+        image, state = _parts(shown, self._spec)
+        return task._replace(demos=(Demo(image, state, np.asarray(shown["action"], np.float32)),))
+
+    def begin(self, tasks: Sequence[Task]) -> None:
+        """Resets the world if the episode has not begun."""
+        if self.outcome is None or not self.is_over:
+            return
+        _, task, seed = self.outcome.episode
+        try:
+            self.connect()
+            seen = self._ask({"do": "reset", "task": tasks[task].name, "seed": seed})[1]
+        except WorldError as error:
+            self._lose(error)
+            return
+        self.is_over = False
+        self._see(seen)
+
+    def step(self, action: np.ndarray | None) -> None:
+        """Does one step, if there is an episode; a random one without an action."""
+        outcome = self.outcome
+        if outcome is None or self.is_over:
+            return
+        try:
+            header, seen = self._ask({"do": "step"}, **({} if action is None else {"action": action}))
+        except WorldError as error:
+            self._lose(error)
+            return
+        outcome.steps += 1
+        outcome.end = header["success"]
+        outcome.ever |= outcome.end
+        self.is_over = header["ended"] or outcome.steps >= self._max_steps
+        self._see(seen)
+
+    def _ask(self, request: dict[str, Any], **arrays: np.ndarray) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        assert self._client is not None
+        return self._client.ask(request, **arrays)
+
+    def _lose(self, error: WorldError) -> None:
+        assert self.outcome is not None
+        self.outcome.lost, self.outcome.ever, self.outcome.end = str(error), False, False
+        self._client, self.is_over = None, True
+
+    def _see(self, arrays: dict[str, np.ndarray]) -> None:
+        self.observation = check_observation(Observation(*_parts(arrays, self._spec)), self._spec)
+        assert self.outcome is not None
+        if self.outcome.episode[::2] == ("own", self._first_seed) and self.observation.image is not None:
+            self.outcome.images.append(np.asarray(self.observation.image))
+
+
+def _parts(arrays: dict[str, np.ndarray], spec: Spec) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Takes what a policy sees out of an observation or a demonstration; larger images are shrunk as at import."""
+    image, state = arrays.get("image"), arrays.get("state")
+    if (
+        image is not None
+        and spec.image_shape is not None
+        and shrunk(image.shape[-3:], spec.image_shape[0]) == (spec.image_shape)
+    ):
+        frames = image.reshape(-1, *image.shape[-3:])
+        image = np.stack(list(resized(iter(frames), spec.image_shape))).reshape(*image.shape[:-3], *spec.image_shape, 3)
+    state = np.asarray(state, np.float32) if spec.state_size and state is not None else None
+    return image if spec.image_shape is not None else None, state
+
+
+def _nothing(spec: Spec) -> Observation:
+    image = None if spec.image_shape is None else np.zeros((*spec.image_shape, 3), np.uint8)
+    return Observation(image, np.zeros(spec.state_size, np.float32) if spec.state_size else None)

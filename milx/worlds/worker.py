@@ -1,0 +1,165 @@
+"""A world in a process of its own. This file needs Python, NumPy and your code, and nothing of milx.
+
+    python worker.py module:function
+
+`function(task)` returns a Gymnasium environment in which the task of that name is to be done. Its observations are
+dictionaries with "image", uint8 [H, W, 3], or "state", real numbers [S], or both; LeRobot's names "pixels" and
+"agent_pos" mean the same. An array alone is an image if it looks like one, and a state otherwise.
+`info["is_success"]`, or else `info["success"]`, tells after every step whether the task is done. Actions are clipped to
+the environment's limits. An environment may have a method `demonstrate(seed)`, which returns a demonstration as a
+dictionary with the arrays "image", "state" and "action", [T, ...].
+
+The process reads requests from standard input and writes a reply to each to standard output. Both are messages: four
+bytes, little-endian, hold the length of a JSON object; the object follows, and then the bytes of the arrays that its
+"arrays" lists, each as [name, type, shape], in C order. What the world prints goes to standard error.
+
+| request | arrays | reply | arrays |
+|---|---|---|---|
+| when the process starts | | {"protocol": 1} | |
+| {"do": "reset", "task": NAME, "seed": NUMBER} | | {} | the observation |
+| {"do": "step"} | "action" [A]; none for a random one | {"success": BOOL, "ended": BOOL} | the observation |
+| {"do": "demonstrate", "task": NAME, "seed": NUMBER} | | {} | the demonstration; none if the world shows none |
+
+A reply {"error": TEXT} says what went wrong. The process ends when its input ends.
+"""
+
+import importlib
+import json
+import os
+import struct
+import sys
+import traceback
+
+import numpy as np
+
+PROTOCOL = 1
+"""The number of the protocol above."""
+NAMES = {"image": ("image", "pixels"), "state": ("state", "agent_pos")}
+"""Names of the parts of an observation, by the name in messages."""
+
+
+def send(stream, header, arrays=None):
+    """Writes a message."""
+    arrays = {name: np.ascontiguousarray(array) for name, array in (arrays or {}).items()}
+    listed = [[name, array.dtype.str, list(array.shape)] for name, array in arrays.items()]
+    content = json.dumps({**header, "arrays": listed}).encode()
+    stream.write(struct.pack("<I", len(content)) + content)
+    for array in arrays.values():
+        stream.write(array.tobytes())
+    stream.flush()
+
+
+def receive(read):
+    """Reads a message with a function that returns so many bytes; returns the JSON object and the arrays by name."""
+    header = json.loads(read(*struct.unpack("<I", read(4))))
+    arrays = {}
+    for name, dtype, shape in header.pop("arrays"):
+        dtype = np.dtype(dtype)
+        if dtype.hasobject or dtype.itemsize == 0:
+            raise ValueError(f"{name}: got type {dtype}, expected numbers")
+        size = dtype.itemsize * int(np.prod(shape, dtype=np.int64))
+        arrays[name] = np.frombuffer(read(size), dtype).reshape(shape)
+    return header, arrays
+
+
+class World:
+    """Answers requests with the environments that the user's function makes."""
+
+    def __init__(self, make):
+        self._make = make
+        self._env = self._task = None
+
+    def reset(self, task, seed):
+        """Starts an episode; random actions depend on the seed, too."""
+        env = self._of(task)
+        env.action_space.seed(seed)
+        observation, _ = env.reset(seed=seed)
+        return {}, _seen(observation)
+
+    def step(self, action):
+        """Does one step, with a random action if there is none."""
+        env = self._of(self._task)
+        if action is None:
+            action = env.action_space.sample()
+        elif hasattr(env.action_space, "low"):
+            action = np.clip(action, env.action_space.low, env.action_space.high).astype(env.action_space.dtype)
+        observation, _, terminated, truncated, info = env.step(action)
+        success = info.get("is_success", info.get("success"))
+        if success is None:
+            raise ValueError("info: has neither is_success nor success, expected one of them after every step")
+        return {"success": bool(success), "ended": bool(terminated or truncated)}, _seen(observation)
+
+    def demonstrate(self, task, seed):
+        """Shows the task, if the environment can."""
+        env = self._of(task)
+        while env is not None and not hasattr(type(env), "demonstrate"):
+            env = getattr(env, "env", None)
+        return {}, {} if env is None else {name: np.asarray(value) for name, value in env.demonstrate(seed).items()}
+
+    def _of(self, task):
+        if task != self._task or self._env is None:
+            if self._env is not None:
+                self._env.close()
+            self._env, self._task = self._make(task), task
+        return self._env
+
+
+def _seen(observation):
+    """Takes the image and the state out of an observation."""
+    if not isinstance(observation, dict):
+        array = np.asarray(observation)
+        observation = {"image" if array.dtype == np.uint8 and array.ndim == 3 else "state": array}
+    found = {}
+    for part, names in NAMES.items():
+        for name in names:
+            if name in observation and part not in found:
+                found[part] = np.asarray(observation[name])
+    if not found:
+        raise ValueError(f"observation: has {sorted(observation)}, expected image, state or both")
+    return found
+
+
+def answer(world, header, arrays):
+    """Does what a request says; returns the reply's JSON object and arrays."""
+    if header["do"] == "reset":
+        return world.reset(header["task"], header["seed"])
+    if header["do"] == "step":
+        return world.step(arrays.get("action"))
+    if header["do"] == "demonstrate":
+        return world.demonstrate(header["task"], header["seed"])
+    raise ValueError(f"do: got {header['do']!r}, expected reset, step or demonstrate")
+
+
+def main():
+    """Answers requests until there are no more."""
+    requests, replies = sys.stdin.buffer, os.fdopen(os.dup(sys.stdout.fileno()), "wb")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # what the world prints must not end up among the replies
+
+    def read(size):
+        content = requests.read(size)
+        if len(content) < size:
+            raise EOFError
+        return content
+
+    try:
+        module, _, name = sys.argv[1].partition(":")
+        sys.path.insert(0, "")  # as `python -m` does
+        world = World(getattr(importlib.import_module(module), name))
+    except Exception:
+        send(replies, {"error": traceback.format_exc()})
+        return
+    send(replies, {"protocol": PROTOCOL})
+    while True:
+        try:
+            header, arrays = receive(read)
+        except EOFError:
+            return
+        try:
+            reply = answer(world, header, arrays)
+        except Exception:
+            reply = {"error": traceback.format_exc()}, None
+        send(replies, *reply)
+
+
+if __name__ == "__main__":
+    main()

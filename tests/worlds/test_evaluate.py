@@ -1,0 +1,210 @@
+"""Evaluation in worlds that are not milx's, against the same episodes one after the other in this process."""
+
+import dataclasses
+import io
+import json
+import pathlib
+import re
+import sys
+import time
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from rich.console import Console
+
+from milx.config.assemble import make_config
+from milx.data import RECORDED
+from milx.data.dataset import Writer
+from milx.deploy.policy import Policy
+from milx.evaluation.intervals import wilson_interval
+from milx.methods.base import Method
+from milx.types import Demo, Spec
+from milx.worlds import report, summarize
+from milx.worlds.actor import CONTROLS, other_tasks
+from milx.worlds.client import Client, WorldError
+from milx.worlds.evaluate import evaluate_in
+from milx.worlds.slot import Episode, Outcome, Task
+
+WORLDS = pathlib.Path(__file__).parents[1] / "fixtures" / "worlds"
+sys.path.insert(0, str(WORLDS))
+import point_world  # noqa: E402
+
+
+class Follower(Method):
+    """Goes where a demonstration has ended, in steps of a fifth of the way that grow with every step."""
+
+    def init(self, key, whitening):
+        raise NotImplementedError
+
+    def loss(self, params, batch, progress=1.0):
+        raise NotImplementedError
+
+    def adapt(self, params, demo):
+        return demo.state[:, -1].mean(axis=0)
+
+    def unadapted(self, params):
+        return params["nowhere"]
+
+    def act(self, task_params, observation, memory):
+        return (task_params - observation.state) * jnp.minimum(0.2 + 0.1 * memory, 1.0), memory + 1
+
+    def initial_memory(self, key):
+        return jnp.zeros(())
+
+
+@pytest.fixture
+def policy():
+    config = make_config(RECORDED, preset="cpu")
+    config.recorded.path, config.recorded.horizon = "somewhere", 6
+    return Policy(Follower(), Spec(None, 2, 2, None, ()), {"nowhere": jnp.zeros(2)}, config)
+
+
+@pytest.fixture(autouse=True)
+def folder(monkeypatch):
+    monkeypatch.chdir(WORLDS)
+
+
+TASKS = [Task(name, name.partition("/")[0]) for name in point_world.GOALS]
+
+
+def alone(task, seed, control, policy):
+    """Runs an episode without workers and batches; returns whether the task was done at any time, and at last."""
+    env, number = point_world.PointWorld(task.name), TASKS.index(task)
+    shown = point_world.PointWorld(task.name).demonstrate(99)
+    source = number if control not in ("same_family", "other_family") else other_tasks(TASKS, number)[control]
+    goal = point_world.PointWorld(TASKS[source].name).demonstrate(99)["state"][-1]
+    goal = np.zeros(2) if control == "unadapted" else goal
+    env.action_space.seed(seed)
+    position, _ = env.reset(seed=seed)
+    done = []
+    for step in range(point_world.LENGTH):
+        action = {
+            "replay": shown["action"][step],
+            "mean_action": shown["action"].mean(axis=0),
+            "random": env.action_space.sample(),
+        }.get(control, (goal - position) * min(0.2 + 0.1 * step, 1.0))
+        position, _, _, _, info = env.step(np.clip(action, -0.5, 0.5))
+        done.append(bool(info["is_success"]))
+    return any(done), done[-1]
+
+
+def test_episodes_end_as_they_do_one_after_the_other(policy):
+    """Runs all controls in three worlds at once; every outcome is that of a loop in this process."""
+    outcomes = evaluate_in(policy, "point_world:make", TASKS, episodes=3, seed=100, workers=3)
+    assert len(outcomes) == len(TASKS) * len(CONTROLS) * 3
+    for outcome in outcomes:
+        control, task, seed = outcome.episode
+        assert outcome.lost is None
+        assert outcome.steps == point_world.LENGTH
+        assert (outcome.ever, outcome.end) == alone(TASKS[task], seed, control, policy), outcome.episode
+    rate = {name: np.mean([o.end for o in outcomes if o.episode.control == name]) for name in CONTROLS}
+    assert rate["own"] == 1
+    assert rate["replay"] > rate["other_family"] == rate["same_family"] == rate["unadapted"] == 0
+
+
+def test_worlds_that_fail_cost_their_episodes_and_are_reported(policy):
+    began = time.monotonic()
+    demo = Demo(state=np.ones((6, 2)), action=np.zeros((6, 2)))
+    outcomes = evaluate_in(
+        policy,
+        "point_world:make_frail",
+        [Task("near/right", "near", (demo,))],
+        controls=["own"],
+        episodes=6,
+        workers=2,
+        timeout=3.0,
+    )
+    assert time.monotonic() - began < 30
+    lost = [outcome.lost for outcome in outcomes]
+    assert [not reason and outcome.end for reason, outcome in zip(lost, outcomes, strict=True)] == [
+        True,
+        False,
+        False,
+        False,
+        True,
+        True,
+    ]
+    assert "has ended (exit code 7)" in lost[1]
+    assert "has not answered within 3 s" in lost[2]
+    assert "ZeroDivisionError: the world's own error" in lost[3]
+
+
+def test_worlds_that_cannot_be_started_say_why(policy):
+    for make, message in (
+        ("no_such_module:make", "No module named 'no_such_module'"),
+        ("point_world:no_such_function", "has no attribute 'no_such_function'"),
+    ):
+        with pytest.raises(WorldError, match=message):
+            evaluate_in(policy, make, TASKS, workers=1)
+    with pytest.raises(WorldError, match="python: no_such_python cannot be run: No such file"):
+        evaluate_in(policy, "point_world:make", TASKS, workers=1, python="no_such_python")
+    with pytest.raises(ValueError, match="controls: got 'expert', expected some of own"):
+        evaluate_in(policy, "point_world:make", TASKS, controls=["expert"])
+
+
+def test_larger_pictures_are_shrunk_and_other_ones_refused(policy):
+    spec = dataclasses.replace(policy.spec, image_shape=(20, 30))
+    demo = Demo(np.zeros((6, 20, 30, 3), np.uint8), np.zeros((6, 2)), np.zeros((6, 2)))
+    tasks = [Task("near/left", "near", (demo,))]
+    seeing = dataclasses.replace(policy, spec=spec)
+    (outcome,) = evaluate_in(seeing, "point_world:make_pictured", tasks, controls=["own"], episodes=1, workers=1)
+    assert "info: has neither is_success nor success" in outcome.lost
+    other = dataclasses.replace(policy, spec=dataclasses.replace(spec, image_shape=(20, 20)))
+    square = [Task("near/left", "near", (dataclasses.replace(demo, image=demo.image[:, :, :20]),))]
+    with pytest.raises(ValueError, match=r"observation.image: got shape \[40, 60, 3\], expected \[20, 20, 3\]"):
+        evaluate_in(other, "point_world:make_pictured", square, controls=["random"], episodes=1, workers=1)
+
+
+def test_the_protocol_carries_arrays_of_every_type():
+    """Asks the world's process itself, as a policy of somebody else's would."""
+    client = Client("point_world:make_pictured", sys.executable, 60)
+    _, seen = client.ask({"do": "reset", "task": "near/left", "seed": 5})
+    world = point_world.Pictured("near/left")
+    expected, _ = world.reset(seed=5)
+    np.testing.assert_array_equal(seen["state"], expected["agent_pos"])
+    np.testing.assert_array_equal(seen["image"], expected["pixels"])
+    assert seen["state"].dtype == np.float64
+    with pytest.raises(WorldError, match="do: got 'dance', expected reset, step or demonstrate"):
+        client.ask({"do": "dance"})
+
+
+def test_a_run_is_evaluated_in_the_world_whose_tasks_its_data_set_names(policy, monkeypatch, tmp_path):
+    """Holds out two tasks of a data set; the report says of each control how often it succeeded."""
+    with Writer(tmp_path / "set", None, 2, 2, "a test") as writer:
+        for name, split in zip(point_world.GOALS, ("train", "validation", "test", "test"), strict=True):
+            shown = point_world.PointWorld(name).demonstrate(7)
+            writer.add(name, split, [point_world.LENGTH], [Demo(**shown)])
+    policy.config.recorded.path = str(tmp_path / "set")
+    monkeypatch.setattr(report, "load_run", lambda folder: policy)
+    console = Console(file=io.StringIO(), width=200)
+    report.report_on(policy.config, tmp_path, "point_world:make", console, episodes=4, workers=2)
+    found = json.loads((tmp_path / "gym.json").read_text())
+    assert found["tasks"] == ["far/left", "far/right"]
+    assert set(found["controls"]) == set(CONTROLS) - {"other_family"}
+    own = found["controls"]["own"]
+    assert (own["episodes"], own["lost"], own["ever"], own["end"]) == (8, 0, 1.0, 1.0)
+    assert own["end_wilson95"] == pytest.approx(wilson_interval(8, 8))
+    assert found["controls"]["same_family"]["ever"] == 0
+    assert re.search(r"adapted to the task's own demonstration.* 100.0% \(67.6% to 100.0%\)", console.file.getvalue())
+
+
+def test_lost_episodes_count_as_episodes_without_success():
+    tasks = [Task("a", "one"), Task("b", "two")]
+    outcomes = [
+        Outcome(Episode("own", 0, 0), ever=True, end=True, steps=4),
+        Outcome(Episode("own", 0, 1), ever=True, end=False, steps=6),
+        Outcome(Episode("own", 1, 0), steps=2, lost="it has ended"),
+        Outcome(Episode("random", 1, 0), steps=8),
+    ]
+    found = summarize(outcomes, tasks)
+    assert list(found) == ["own", "random"]
+    own = found["own"]
+    assert (own["episodes"], own["lost"], own["steps"]) == (3, 1, 4)
+    assert (own["ever"], own["end"]) == (pytest.approx(2 / 3), pytest.approx(1 / 3))
+    assert own["ever_wilson95"] == wilson_interval(2, 3)
+    assert {name: (rates["episodes"], rates["ever"]) for name, rates in own["families"].items()} == {
+        "one": (2, 1.0),
+        "two": (1, 0.0),
+    }
+    assert report.losses(outcomes, tasks) == ["b, own, seed 0: it has ended"]
