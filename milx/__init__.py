@@ -34,10 +34,12 @@ __all__ = [
 
 
 def __getattr__(name: str) -> ModuleType:
-    """Imports `milx.gym`, which needs Gymnasium, when it is first used."""
+    """Imports `milx.gym`, which needs Gymnasium and MuJoCo, when it is first used."""
     if name == "gym":
         try:
             return importlib.import_module("milx.gym")
         except ModuleNotFoundError as error:
-            raise ImportError("milx.gym needs Gymnasium: install milx with the extra 'gym'") from error
+            raise ImportError(
+                "milx.gym needs Gymnasium and MuJoCo: install milx with the extras 'gym' and 'sim'"
+            ) from error
     raise AttributeError(f"module 'milx' has no attribute {name!r}")

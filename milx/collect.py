@@ -13,7 +13,6 @@ from milx.config.check import check_config
 from milx.config.schema import Config
 from milx.core import pytrees
 from milx.training import command_line
-from milx.training.simulated import demos_of_split
 from milx.types import SPLITS
 
 
@@ -21,6 +20,8 @@ def main(config: Config, workdir: str) -> None:
     """Writes train.npz, validation.npz and test.npz."""
     check_config(config)
     env = envs.make(config.env_name, config.env.image_shape, config.env.action_cost)
+    from milx.training.simulated import demos_of_split  # needs MuJoCo, of which `make` says if it is not there
+
     for split in SPLITS:
         demos = demos_of_split(env, config, split)
         path = pathlib.Path(workdir) / f"{split}.npz"

@@ -8,6 +8,7 @@ entry point in the group "milx.plugins":
 """
 
 import importlib.metadata
+import pkgutil
 import warnings
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -38,7 +39,22 @@ class MethodEntry(NamedTuple):
     overrides: Overrides
 
 
-ENVS: dict[str, Any] = {}
+class _Classes(dict[str, Any]):
+    """Classes by name; one that is registered as "module:class" is imported when it is first asked for."""
+
+    def __getitem__(self, name: str) -> Any:
+        found = super().__getitem__(name)
+        if isinstance(found, str):
+            try:
+                self[name] = found = pkgutil.resolve_name(found)
+            except ModuleNotFoundError as error:
+                if error.name != "mujoco":
+                    raise
+                raise ValueError(f"env: {name!r} needs MuJoCo: install milx with the extra 'sim'") from error
+        return found
+
+
+ENVS: dict[str, Any] = _Classes()
 """Classes of environments by name. They are called with an image shape (H, W) or None."""
 METHODS: dict[str, MethodEntry] = {}
 PRESETS: dict[str, dict[str, Overrides]] = {}
@@ -60,9 +76,20 @@ def register_env(env: Any, presets: dict[str, Overrides], durations: dict[str, s
     Raises:
         ValueError: if the name is already registered.
     """
-    _add(ENVS, "env", env.name, env)
-    register_presets(env.name, presets)
-    DURATIONS[env.name] = durations or {}
+    register_env_at(env.name, env, presets, durations)
+
+
+def register_env_at(
+    name: str, where: Any, presets: dict[str, Overrides], durations: dict[str, str] | None = None
+) -> None:
+    """Registers an environment as `register_env` does, by its name and its class or the place of that, "module:class".
+
+    Raises:
+        ValueError: if the name is already registered.
+    """
+    _add(ENVS, "env", name, where)
+    register_presets(name, presets)
+    DURATIONS[name] = durations or {}
 
 
 def register_presets(env: str, presets: dict[str, Overrides]) -> None:

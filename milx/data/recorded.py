@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from milx.data.dataset import DataSet, spread
+from milx.data.frames import frame_indices
 from milx.data.goals import with_goals
-from milx.data.simulated import frame_indices
 from milx.types import Array, Demo, TaskBatch
 
 MOST_DEMOS = 16

@@ -18,6 +18,7 @@ from milx.config.schema import DataConfig, TrainConfig
 from milx.core import files, pytrees
 from milx.core.batching import map_in_chunks
 from milx.core.messages import warn
+from milx.data.frames import frame_indices
 from milx.data.goals import goals
 from milx.envs.base import Env, State, Task
 from milx.trajopt import expert
@@ -125,22 +126,6 @@ def _draw(env: Env, key: jax.Array, split: str, num_tasks: int, num_demos: int) 
     each = jax.tree.map(lambda x: jnp.repeat(x, num_demos, axis=0), tasks)
     state = jax.vmap(env.reset)(jax.random.split(scene_key, total), each)
     return tasks, each, state, jax.random.split(noise_key, total)
-
-
-def frame_indices(key: jax.Array, length: int, count: int | None, exponent: float = 1.0) -> jax.Array:
-    """Draws n = `count` increasing time steps below T = `length`, one from each of n - 1 parts, and the last one.
-
-    Part i = 0, .., n - 2 begins at floor((T - 1) (i / (n - 1))^e), or one after the part before it if that is later,
-    with the exponent e: at 1 the parts are equally long, above 1 the first ones are the shortest. With `count` None or
-    at least T, all time steps are returned.
-    """
-    if count is None or count >= length:
-        return jnp.arange(length)
-    part = np.arange(count)
-    edges = np.floor((length - 1) * part**exponent / max(count - 1, 1) ** exponent).astype(int)
-    edges = np.maximum.accumulate(edges - part) + part  # no part is empty
-    offset = jax.random.uniform(key, (count - 1,)) * np.diff(edges)
-    return jnp.append(edges[:-1] + offset.astype(jnp.int32), length - 1)
 
 
 def render_demo(env: Env, task: Task, states: State, action: jax.Array, index: jax.Array | None = None) -> Demo:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from milx.core import parallel, pytrees
 from milx.core.batching import map_in_groups
-from milx.evaluation.rollout import replay
+from milx.evaluation.replay import replay
 from milx.methods.base import Method
 from milx.methods.whitening import MIN_STD
 from milx.types import Demo, Params, TaskBatch, TaskParams

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from milx.data.recorded import Recorded
-from milx.evaluation.rollout import replay
+from milx.evaluation.replay import replay
 from milx.methods import Method
 from milx.types import Demo, Params, TaskParams
 

@@ -1,11 +1,11 @@
-"""A policy that acts: in episodes of an environment, in one scan on the device, or on recorded observations."""
+"""A policy that acts in episodes of an environment, in one scan on the device."""
 
 import jax
 import jax.numpy as jnp
 
 from milx.envs.base import Env, State, Task
 from milx.methods.base import Method
-from milx.types import Demo, Memory, Observation, TaskParams
+from milx.types import Demo, Observation, TaskParams
 
 
 def rollout(
@@ -35,19 +35,3 @@ def rollout(
     (last, _), (states, seen, actions) = jax.lax.scan(step, start, length=env.horizon)
     states = jax.tree.map(lambda xs, x: jnp.concatenate([xs, x[None]]), states, last)
     return states, Demo(image=seen.image, state=seen.state, action=actions)
-
-
-def replay(method: Method, task_params: TaskParams, demo: Demo) -> jax.Array:
-    """Chooses actions [T, A] by an adapted policy on the observations of one demonstration [T, ...].
-
-    A policy that remembers sees them one after the other; any other sees them all at once.
-    """
-
-    def act(memory: Memory, seen: tuple) -> tuple[Memory, jax.Array]:
-        action, memory = method.act(task_params, Observation(*seen), memory)
-        return memory, action
-
-    seen, memory = (demo.image, demo.state), method.initial_memory(jax.random.key(0))
-    if jax.tree.leaves(memory):
-        return jax.lax.scan(act, memory, seen)[1]
-    return jax.vmap(lambda one: act(memory, one)[1])(seen)

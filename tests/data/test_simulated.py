@@ -10,6 +10,7 @@ import pytest
 
 from milx.core import pytrees
 from milx.data import simulated as demos_lib
+from milx.data.frames import frame_indices
 
 MANY = 4
 
@@ -190,7 +191,7 @@ def test_demonstrations_of_a_task_have_scenes_of_their_own(trained):
 @pytest.mark.parametrize(("length", "count"), [(50, 6), (50, 2), (50, 1), (50, 49), (10, 3), (7, 6), (3, 2)])
 def test_frames_come_one_from_each_part_and_the_last_always(length, count):
     keys = jax.random.split(jax.random.key(0), 2000)
-    index = np.asarray(jax.vmap(lambda key: demos_lib.frame_indices(key, length, count))(keys))
+    index = np.asarray(jax.vmap(lambda key: frame_indices(key, length, count))(keys))
     assert index.shape == (2000, count)
     assert (np.diff(index, axis=1) > 0).all()
     assert (index[:, -1] == length - 1).all()
@@ -205,7 +206,7 @@ def test_frames_come_one_from_each_part_and_the_last_always(length, count):
 @pytest.mark.parametrize(("length", "count", "exponent"), [(50, 4, 2.0), (100, 8, 2.0), (50, 10, 3.0), (9, 8, 2.0)])
 def test_a_larger_exponent_draws_more_of_the_beginning(length, count, exponent):
     keys = jax.random.split(jax.random.key(1), 20_000)
-    index = np.asarray(jax.vmap(lambda key: demos_lib.frame_indices(key, length, count, exponent))(keys))
+    index = np.asarray(jax.vmap(lambda key: frame_indices(key, length, count, exponent))(keys))
     assert (np.diff(index, axis=1) > 0).all()
     assert (index[:, -1] == length - 1).all()
     # Each part is drawn from evenly, so its mean is that of its ends, which are T - 1 times (i / (n - 1))^e.
@@ -219,7 +220,7 @@ def test_a_larger_exponent_draws_more_of_the_beginning(length, count, exponent):
 
 @pytest.mark.parametrize("count", [None, 5, 8])
 def test_all_frames(count):
-    np.testing.assert_array_equal(demos_lib.frame_indices(jax.random.key(0), 5, count), np.arange(5))
+    np.testing.assert_array_equal(frame_indices(jax.random.key(0), 5, count), np.arange(5))
 
 
 def test_rendered_states_are_the_robot_s(trained):

@@ -11,7 +11,7 @@ from milx.config import assemble
 from milx.deploy import standalone
 from milx.deploy.policy import Policy
 from milx.evaluation import listening
-from milx.evaluation.rollout import replay
+from milx.evaluation.replay import replay
 from milx.export import export
 from milx.methods.mil import MIL, MILConfig
 from milx.methods.whitening import Whitening

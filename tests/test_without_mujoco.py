@@ -1,0 +1,72 @@
+"""Where MuJoCo is not installed, all works that does not simulate in milx's own environments."""
+
+import json
+import os
+import pathlib
+import subprocess
+import sys
+
+import pytest
+
+FAILURES = pathlib.Path(__file__).parents[1] / "experiments" / "robustness"
+sys.path.insert(0, str(FAILURES))
+import failures  # noqa: E402
+
+BLOCK = """
+import sys
+
+class Blocked:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] == "mujoco":
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+sys.meta_path.insert(0, Blocked())
+"""
+
+
+def run(program, *arguments):
+    """Runs a program in a process in which mujoco cannot be imported."""
+    command = [sys.executable, "-c", BLOCK + program, *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, env={**os.environ, "JAX_PLATFORMS": "cpu"})
+
+
+def test_only_environments_need_it():
+    program = """
+import milx, milx.collect, milx.evaluate, milx.export, milx.train
+import milx.data.check, milx.data.lerobot, milx.data.robomimic
+from milx.config.assemble import make_config
+from milx.training.factory import make_run
+
+for needs in (
+    lambda: milx.make("reach"), lambda: milx.load("push"), lambda: make_run(make_config("place", preset="cpu"), "run")
+):
+    try:
+        needs()
+    except ValueError as error:
+        print(error)
+"""
+    done = run(program)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert done.stdout.splitlines() == [
+        f"env: {name!r} needs MuJoCo: install milx with the extra 'sim'" for name in ("reach", "push", "place")
+    ]
+    assert done.stderr == ""
+
+
+@pytest.mark.slow
+def test_a_life_on_recorded_demonstrations_needs_none(tmp_path):
+    """Imports, trains, evaluates, exports and loads, with the parameters of a life with MuJoCo."""
+    failures.write_recording(tmp_path)
+    for name in ("with", "without"):
+        (tmp_path / name).mkdir()
+    expected = failures.begin(tmp_path / "with")
+    assert expected.code == 0, expected.errors[-2000:]
+    program = f"""
+sys.path.insert(0, {str(FAILURES)!r})
+import pathlib
+import failures
+failures.live(pathlib.Path(sys.argv[1]), 0, "")
+"""
+    done = run(program, tmp_path / "without")
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert json.loads(done.stdout.splitlines()[-1])["params"] == expected.result["params"]
