@@ -1,5 +1,7 @@
 """Looks at a data set and says what will go wrong: python -m milx.data.check PATH."""
 
+import collections
+
 import numpy as np
 from absl import app
 from rich.console import Console
@@ -28,6 +30,10 @@ def problems(data: DataSet) -> list[str]:
             found.append(f"task {task.name!r} has {len(task.lengths)} demonstration: one more must be the query")
         elif not any(task.has_action):
             found.append(f"task {task.name!r} shows no actions: it cannot be learned from")
+    for split in SPLITS[1:]:
+        families = {head.tasks[i].family for i in head.of_split(split)}
+        if len(families) == 1 and len({task.family for task in head.tasks}) > 1:
+            found.append(f"all {split} tasks are of the family {families.pop()!r}: they say nothing of the others")
     lengths = [length for task in head.tasks for length in task.lengths]
     if lengths and max(lengths) > _SPREAD * min(lengths):
         found.append(f"lengths from {min(lengths)} to {max(lengths)} steps: all are resampled to recorded.horizon")
@@ -84,6 +90,10 @@ def describe(data: DataSet, console: Console) -> None:
         console.print(
             f"{split}: {len(names)} tasks{': ' if names else ''}{', '.join(names[:5])}{' ...' if names[5:] else ''}"
         )
+    families = collections.Counter(task.family for task in head.tasks)
+    if set(families) != {""}:
+        counted = (f"{printable(family)} ({count})" for family, count in sorted(families.items()))
+        console.print(f"families: {', '.join(counted)}")
     table = Table("", "minimum", "mean", "maximum", "standard deviation")
     for field, values in vectors(data).items():
         with np.errstate(invalid="ignore"):

@@ -25,53 +25,13 @@ import tensorstore as ts
 
 from milx.core import files
 from milx.core.files import MAX_BYTES, FileError
+from milx.data.header import VERSION, Header, TaskInfo, read_header
 from milx.types import SPLITS, Demo
 
-VERSION = 1
 ALL_FIELDS = ("image", "state", "action")
 _CHUNK_BYTES = 1 << 20
 _MAX_CHUNK_BYTES = 1 << 28
 _GROUP = {"zarr_format": 3, "node_type": "group"}
-
-
-@dataclasses.dataclass(frozen=True)
-class TaskInfo:
-    """A task of a data set.
-
-    Attributes:
-        name: what it is called.
-        split: "train", "validation" or "test".
-        lengths: time steps of each of its demonstrations.
-        has_action: whether each of them shows actions.
-    """
-
-    name: str
-    split: str
-    lengths: tuple[int, ...]
-    has_action: tuple[bool, ...]
-
-
-@dataclasses.dataclass(frozen=True)
-class Header:
-    """What a data set holds.
-
-    Attributes:
-        image_shape: (H, W); None without images.
-        state_size: S, 0 without states.
-        action_size: A.
-        tasks: all tasks, in the order of their folders.
-        source: where they come from, for people.
-    """
-
-    image_shape: tuple[int, int] | None
-    state_size: int
-    action_size: int
-    tasks: tuple[TaskInfo, ...]
-    source: str = ""
-
-    def of_split(self, split: str) -> list[int]:
-        """Lists the numbers of the split's tasks."""
-        return [i for i, task in enumerate(self.tasks) if task.split == split]
 
 
 class Writer:
@@ -123,7 +83,7 @@ class Writer:
             header = dataclasses.replace(self._header, tasks=tuple(self._tasks))
             _write_group(self._partial, {"milx": {"version": VERSION, **dataclasses.asdict(header)}})
 
-    def add(self, name: str, split: str, lengths: list[int], demos: Iterable[Demo]) -> None:
+    def add(self, name: str, split: str, lengths: list[int], demos: Iterable[Demo], family: str = "") -> None:
         """Writes a task.
 
         Args:
@@ -131,6 +91,7 @@ class Writer:
             split: "train", "validation" or "test".
             lengths: time steps of its demonstrations.
             demos: as many; with arrays [T, ...], and no action where the demonstration shows none.
+            family: the kind of task; "" for none.
 
         Raises:
             ValueError: for a split that does not exist, or a demonstration without time steps or of another shape than
@@ -164,7 +125,7 @@ class Writer:
                 except ValueError as error:  # as TensorStore reports a full disk, too
                     raise FileError(f"{self.folder}: cannot be written: {str(error)[:300]}") from error
             start += length
-        self._tasks.append(TaskInfo(name, split, tuple(lengths), tuple(has_action)))
+        self._tasks.append(TaskInfo(name, split, tuple(lengths), tuple(has_action), family))
 
 
 class DataSet:
@@ -182,12 +143,18 @@ class DataSet:
 
     def __init__(self, folder: str | pathlib.Path):
         self.folder = pathlib.Path(folder)
-        self.header = _read_header(self.folder)
+        self.header = read_header(self.folder)
         self._arrays: dict[tuple[int, str], Any] = {}
 
     def fingerprint(self) -> str:
-        """Computes the SHA-256 of the header and of all states and actions; images count by their sizes alone."""
-        digest = hashlib.sha256(json.dumps(dataclasses.asdict(self.header)).encode())
+        """Computes the SHA-256 of the header and of all states and actions.
+
+        Images count by their sizes alone, and families not at all, as nothing is learned from them.
+        """
+        header = dataclasses.asdict(self.header)
+        for task in header["tasks"]:
+            del task["family"]
+        digest = hashlib.sha256(json.dumps(header).encode())
         for i in range(len(self.header.tasks)):
             for field in ("state", "action"):
                 if field in _fields(self.header):
@@ -295,46 +262,3 @@ def _create(path: pathlib.Path, shape: tuple[int, ...], dtype: Any) -> Any:
 
 def _write_group(folder: pathlib.Path, attributes: dict[str, Any]) -> None:
     files.write_json(folder / "zarr.json", {**_GROUP, "attributes": attributes})
-
-
-def _read_header(folder: pathlib.Path) -> Header:
-    path = folder / "zarr.json"
-    if not path.is_file():
-        raise ValueError(f"data: {folder} has no zarr.json, expected a folder written by milx.data")
-    whole = files.read_json(path)
-    try:
-        values = dict(whole["attributes"]["milx"])
-        version = values.pop("version")
-        if version != VERSION:
-            raise ValueError(f"version: got {version!r}, expected {VERSION}")
-        return _parse_header(values)
-    except (KeyError, TypeError, AttributeError, ValueError, RecursionError) as error:
-        raise FileError(f"{path}: expected the header of a milx data set: {error}") from error
-
-
-def _parse_header(values: dict[str, Any]) -> Header:
-    shape = values["image_shape"]
-    sizes = [values["state_size"], values["action_size"], *(shape or ())]
-    whole = all(isinstance(size, int) and 0 <= size < 1 << 20 for size in sizes) and sizes[1] > 0
-    if not whole or (shape is not None and (len(shape) != 2 or 0 in shape)):
-        got = f"image_shape {shape}, state_size {sizes[0]} and action_size {sizes[1]}"
-        raise ValueError(f"sizes: got {got}, expected whole numbers, two of them for images; actions, too")
-    tasks = []
-    for i, task in enumerate(values["tasks"]):
-        info = TaskInfo(task["name"], task["split"], tuple(task["lengths"]), tuple(task["has_action"]))
-        if not isinstance(info.name, str):
-            raise ValueError(f"tasks[{i}].name: got {info.name!r:.100}, expected text")
-        if info.split not in SPLITS:
-            raise ValueError(f"tasks[{i}].split: got {info.split!r}, expected one of {', '.join(SPLITS)}")
-        if not all(isinstance(length, int) and 0 < length < 1 << 40 for length in info.lengths):
-            raise ValueError(f"tasks[{i}].lengths: got {list(info.lengths)}, expected positive numbers")
-        if len(info.has_action) != len(info.lengths):
-            raise ValueError(f"tasks[{i}].has_action: got {len(info.has_action)}, expected {len(info.lengths)}")
-        tasks.append(info)
-    return Header(
-        None if shape is None else tuple(shape),
-        values["state_size"],
-        values["action_size"],
-        tuple(tasks),
-        str(values["source"]),
-    )

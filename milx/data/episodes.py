@@ -1,8 +1,7 @@
 """What importers share: which episodes make a task, which tasks make a split, and writing them down."""
 
-import hashlib
 import pathlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -10,10 +9,10 @@ from absl import app, flags
 from PIL import Image
 from rich.progress import track
 
-from milx.core import files
 from milx.core.commands import command
-from milx.core.files import FileError
+from milx.data import splits
 from milx.data.dataset import Writer
+from milx.data.splits import PREFIX
 from milx.types import Demo
 
 FLAGS = flags.FLAGS
@@ -61,6 +60,11 @@ def define_flags(*, state: str, action: str, task: str) -> None:
     flags.DEFINE_integer("height", 128, "Maximum number of rows of an image; larger ones are shrunk.", lower_bound=1)
     flags.DEFINE_float("validation", 0.1, "Fraction of the tasks that becomes validation tasks.")
     flags.DEFINE_float("test", 0.1, "Fraction of the tasks that becomes test tasks.")
+    family = f"What tasks have in common: {PREFIX!r}, the part of the names before the first '/', or a JSON file that "
+    family += "maps names of tasks to families; none if empty. Each family is split by itself."
+    flags.DEFINE_string("family", "", family)
+    chosen = "A JSON file with the names, or patterns such as 'drawer/*', of the tasks of the splits 'validation' and "
+    flags.DEFINE_string("splits", None, chosen + "'test', in the place of fractions.")
 
 
 def run(argv: list[str], open_source: Callable[[str, Any], Source]) -> None:
@@ -78,12 +82,21 @@ def run(argv: list[str], open_source: Callable[[str, Any], Source]) -> None:
         raise app.UsageError("expected two arguments, PATH and OUT")
     with command():
         source = open_source(argv[1], FLAGS)
-        write(argv[2], source.episodes(FLAGS.task), source.sizes, (FLAGS.validation, FLAGS.test), argv[1])
+        episodes = source.episodes(FLAGS.task)
+        families = splits.families_of({episode.task for episode in episodes}, FLAGS.family)
+        chosen = None if FLAGS.splits is None else splits.read_patterns(FLAGS.splits)
+        write(argv[2], episodes, source.sizes, (FLAGS.validation, FLAGS.test), argv[1], families, chosen)
         print(f"{argv[2]}: look at it with `python -m milx.data.check {argv[2]}`")
 
 
 def write(
-    out: str | pathlib.Path, episodes: Iterable[Episode], sizes: Sizes, held_out: tuple[float, float], source: str
+    out: str | pathlib.Path,
+    episodes: Iterable[Episode],
+    sizes: Sizes,
+    held_out: tuple[float, float],
+    source: str,
+    families: Mapping[str, str] | None = None,
+    chosen: Mapping[str, list[str]] | None = None,
 ) -> None:
     """Writes episodes as a data set (`milx.data.dataset`), its tasks in the order of their names.
 
@@ -93,67 +106,23 @@ def write(
         sizes: of what they show.
         held_out: the fractions of the tasks that become validation and test tasks.
         source: where they come from.
+        families: of the tasks, by name; none if not given.
+        chosen: patterns of the names of validation and test tasks, by split, in the place of `held_out`.
 
     Raises:
-        ValueError: for fractions as `assign_splits` refuses them, or an episode that does not fit the sizes.
+        ValueError: for fractions or patterns as `milx.data.splits` refuses them, or an episode that does not fit the
+            sizes.
     """
     tasks: dict[str, list[Episode]] = {}
     for episode in episodes:
         tasks.setdefault(episode.task, []).append(episode)
-    splits = assign_splits(sorted(tasks), *held_out)
+    families = families or dict.fromkeys(tasks, "")
+    split_of = splits.choose(sorted(tasks), chosen) if chosen else splits.by_family(families, *held_out)
     with Writer(out, *sizes, source) as writer:
         for name in track(sorted(tasks), "writing tasks"):
             own = tasks[name]
             demos = (_as_written(episode, sizes) for episode in own)
-            writer.add(name, splits[name], [episode.length for episode in own], demos)
-
-
-def assign_splits(names: list[str], validation: float, test: float) -> dict[str, str]:
-    """Assigns a split to every task, in an order that depends on nothing but the names; at least one trains.
-
-    Raises:
-        ValueError: unless the fractions are at least 0 and leave something for training.
-    """
-    for field, part in (("validation", validation), ("test", test)):
-        if not 0 <= part < 1:
-            raise ValueError(f"{field}: got {part}, expected a fraction of the tasks, at least 0 and less than 1")
-    if validation + test >= 1:
-        raise ValueError(f"validation + test: got {validation + test}, expected less than 1: the rest is for training")
-    if (needed := 1 + (validation > 0) + (test > 0)) > len(names):
-        raise ValueError(f"tasks: got {len(names)}, expected at least {needed}: one for each split")
-    shuffled = sorted(names, key=lambda name: hashlib.sha256(name.encode(errors="surrogatepass")).digest())
-    second = min(max(round((validation + test) * len(names)), needed - 1), len(names) - 1)
-    first = min(max(round(validation * len(names)), validation > 0), second - (test > 0))
-    of = lambda i: "validation" if i < first else "test" if i < second else "train"  # noqa: E731
-    return {name: of(i) for i, name in enumerate(shuffled)}
-
-
-def read_mapping(path: str | pathlib.Path) -> dict[str, str]:
-    """Reads a JSON object from the names of episodes to the names of their tasks.
-
-    Raises:
-        ValueError: for a file that holds something else.
-    """
-    try:
-        mapping = files.read_json(pathlib.Path(path).resolve())
-    except FileError as error:
-        raise ValueError(f"task: expected a JSON file at {path}: {error}") from error
-    if not isinstance(mapping, dict) or not all(isinstance(task, str) for task in mapping.values()):
-        raise ValueError(f"task: {path}: expected a JSON object from names of episodes to names of tasks")
-    return mapping
-
-
-def lookup(mapping: dict[str, str], name: str, path: str) -> str:
-    """Looks up the task of an episode.
-
-    Raises:
-        FileError: if the mapping does not say.
-    """
-    if name not in mapping:
-        raise FileError(
-            f"task: {path} does not say to which task episode {name!r} belongs, expected all episodes in it"
-        )
-    return mapping[name]
+            writer.add(name, split_of[name], [episode.length for episode in own], demos, families[name])
 
 
 def shrunk(shape: tuple[int, ...], height: int) -> tuple[int, int]:

@@ -22,6 +22,7 @@ from milx.core import files
 from milx.data import episodes as shared
 from milx.data.dataset import check_size
 from milx.data.episodes import Episode, Sizes
+from milx.data.mapping import lookup, read_mapping
 from milx.types import Demo
 
 _CONVERTER = "python -m lerobot.datasets.v30.convert_dataset_v21_to_v30"
@@ -61,12 +62,12 @@ class LeRobot:
         Args:
             task: "task_index", "file", or the path of a JSON file.
         """
-        mapping = None if task in ("task_index", "file") else shared.read_mapping(task)
+        mapping = None if task in ("task_index", "file") else read_mapping(task, "task")
         found = []
         for row in self._rows():
             number, file = row["episode_index"], self._data_file(row)
             if mapping is not None:
-                name = shared.lookup(mapping, str(number), task)
+                name = lookup(mapping, str(number), task, "task")
             else:
                 name = file.relative_to(self.root).as_posix() if task == "file" else str(row["tasks"][0])
             read = functools.partial(self._read, row, file)

@@ -21,6 +21,7 @@ from milx.core.files import FileError
 from milx.data import episodes as shared
 from milx.data.dataset import check_size
 from milx.data.episodes import Episode, Sizes
+from milx.data.mapping import lookup, read_mapping
 from milx.types import Demo
 
 
@@ -61,13 +62,13 @@ class Robomimic:
         Args:
             task: "file", or the path of a JSON file.
         """
-        mapping = None if task == "file" else shared.read_mapping(task)
+        mapping = None if task == "file" else read_mapping(task, "task")
         found = []
         for path in self.files:
             with _open(path) as file:
                 for demo in _demos(file):
                     name = f"{path.stem}/{demo}"
-                    own = path.stem if mapping is None else shared.lookup(mapping, name, task)
+                    own = path.stem if mapping is None else lookup(mapping, name, task, "task")
                     length = self._length(file, demo)
                     found.append(Episode(own, length, bool(self.action), functools.partial(self._read, path, demo)))
         return found

@@ -33,7 +33,7 @@ def tasks_of(data: DataSet, split: str, policy: Policy) -> list[Task]:
         info = data.header.tasks[number]
         shown = [i for i, has_action in enumerate(info.has_action) if has_action or not needs_action][:shots]
         if len(shown) == shots:
-            tasks.append(Task(info.name, "", tuple(data.read(number, i) for i in shown)))
+            tasks.append(Task(info.name, info.family, tuple(data.read(number, i) for i in shown)))
     if not tasks:
         raise ValueError(f"data: {data.folder} has no {split} task with {shots} demonstrations, expected at least one")
     return tasks

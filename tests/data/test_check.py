@@ -9,7 +9,7 @@ from rich.console import Console
 
 from milx.data import check
 from milx.data.dataset import DataSet, Writer
-from milx.data.episodes import assign_splits
+from milx.data.splits import assign_splits
 from milx.types import Demo
 
 RNG = np.random.default_rng(0)
@@ -101,23 +101,15 @@ def test_names_of_tasks_are_shown_as_they_are(tmp_path, capsys):
     assert "task '[/]' has 1 demonstration" in " ".join(said.split())
 
 
-def test_some_task_always_trains():
-    for count in range(3, 9):
-        for validation in (0.1, 0.3, 0.4, 0.49):
-            splits = list(assign_splits([f"task {i}" for i in range(count)], validation, 0.5).values())
-            assert {"train", "validation", "test"} == set(splits), (count, validation)
-
-
-def test_splits_depend_on_names_alone_and_have_their_sizes():
-    names = [f"task {i}" for i in range(50)]
-    first, again = assign_splits(names, 0.1, 0.2), assign_splits(names[::-1], 0.1, 0.2)
-    assert first == again
-    counts = {split: list(first.values()).count(split) for split in ("train", "validation", "test")}
-    assert counts == {"train": 35, "validation": 5, "test": 10}
-    assert list(first.values()) != sorted(first.values())
-    for parts, message in (((-0.1, 0.1), "validation: got -0.1"), ((0.5, 0.5), r"validation \+ test: got 1.0")):
-        with pytest.raises(ValueError, match=message):
-            assign_splits(names, *parts)
+def test_families_are_counted_and_one_alone_is_reported(tmp_path):
+    with Writer(tmp_path / "set", (8, 8), 2, 2, "a test") as writer:
+        splits = ["train", "train", "validation", "test", "test"]
+        for i, (split, family) in enumerate(zip(splits, ["door", "drawer", "door", "door", "drawer"], strict=True)):
+            writer.add(f"task {i}", split, [10, 10], [good(), good()], family)
+    data, out = DataSet(tmp_path / "set"), io.StringIO()
+    assert check.problems(data) == ["all validation tasks are of the family 'door': they say nothing of the others"]
+    check.describe(data, Console(file=out, width=200))
+    assert "families: door (3), drawer (2)" in out.getvalue()
 
 
 def test_names_cannot_speak_to_the_terminal(tmp_path):

@@ -98,7 +98,7 @@ def test_files_or_a_mapping_make_tasks(tmp_path):
     path.write_text(json.dumps({str(i): "even" if i % 2 == 0 else "odd" for i in range(9)}))
     assert [episode.task for episode in open_set().episodes(str(path))] == ["even", "odd"] * 4 + ["even"]
     path.write_text(json.dumps({"0": "even"}))
-    with pytest.raises(ValueError, match="does not say to which task episode '1' belongs"):
+    with pytest.raises(ValueError, match="does not say where '1' belongs"):
         open_set().episodes(str(path))
 
 
