@@ -210,6 +210,9 @@ class TrainConfig:
 class EvalConfig:
     """Closed-loop evaluation.
 
+    Runs on recorded demonstrations have it only if `gym` is set; they read that, `gym_python`, `gym_workers`, `trials`
+    and `shots` alone.
+
     Attributes:
         validation_tasks: held-out tasks for selecting the best checkpoint.
         tasks: held-out tasks for the reported result (test tasks).
@@ -218,6 +221,10 @@ class EvalConfig:
             demonstration are tried, too.
         shots: demonstrations that the policy adapts to.
         batch: tasks rolled out at once.
+        gym: "module:function", which makes the world (`milx.worlds`) in which checkpoints are validated; None for the
+            errors of the actions.
+        gym_python: the interpreter that runs it; None for this one.
+        gym_workers: worlds at once.
     """
 
     validation_tasks: int = 100
@@ -226,6 +233,9 @@ class EvalConfig:
     baseline_trials: int = 10
     shots: int = 1
     batch: int = 150
+    gym: str | None = None
+    gym_python: str | None = None
+    gym_workers: int = 4
 
 
 @dataclasses.dataclass

@@ -133,12 +133,14 @@ def parse(argv: Sequence[str], values: flags.FlagValues = FLAGS) -> list[str]:
 def _check_fields(argv: Sequence[str], config: Config) -> None:
     """Raises flags.Error for --config.NAME where there is no such field; lists those that exist."""
     known = assemble.fields(config)
-    unread = ("env.", "data.", "evaluation.", "train.redraw") if config.env_name == RECORDED else ("recorded.",)
+    is_recorded = config.env_name == RECORDED
+    unread = ("env.", "data.", "evaluation.", "train.redraw") if is_recorded else ("recorded.", "evaluation.gym")
+    worlds = [f"config.evaluation.{name}" for name in ("gym", "gym_python", "gym_workers", "shots", "trials")]
     for arg in argv[1:]:
         name = arg.lstrip("-").split("=")[0]
-        read = not name.removeprefix("config.").startswith(unread) or name == "config.evaluation.shots"
+        read = not name.removeprefix("config.").startswith(unread) or (is_recorded and name in worlds)
         if name.startswith("config.") and not read:
-            where = "without --data" if config.env_name == RECORDED else "with --data"
+            where = "without --data" if is_recorded else "with --data"
             raise flags.Error(f"--{name}: expected only {where}; nothing reads it here")
         if name.startswith("config.") and (field := name.removeprefix("config.")) in _OWN_FLAGS:
             raise flags.Error(f"--{name}: expected --{_OWN_FLAGS[field]}, which also chooses the defaults")

@@ -1,11 +1,13 @@
 """Runs on recorded demonstrations: no simulator, so a policy is judged by the actions that it predicts.
 
 Its score is how much closer its actions come, after adaptation, to those of a held-out task's other demonstrations than
-the mean action of the training tasks does: 1 minus the ratio of the squared errors.
+the mean action of the training tasks does: 1 minus the ratio of the squared errors. With `evaluation.gym`, checkpoints
+are chosen by the policy's success in a world instead.
 """
 
 import functools
 import pathlib
+import sys
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -22,7 +24,7 @@ from milx.data import RECORDED
 from milx.data.dataset import DataSet, spread
 from milx.data.goals import with_goals
 from milx.data.recorded import MOST_DEMOS, Recorded, Shards, read_demos, sample_batch
-from milx.deploy.policy import read_spec
+from milx.deploy.policy import Policy, read_spec
 from milx.evaluation import plots
 from milx.evaluation.open_loop import task_errors
 from milx.methods import whitening
@@ -30,6 +32,8 @@ from milx.training.metrics import read_metrics
 from milx.training.run import Run
 from milx.training.state import Training
 from milx.types import SPEC_FILE, Demo, Params, Spec, TaskBatch
+from milx.worlds.client import Client
+from milx.worlds.evaluate import evaluate_in, tasks_of
 
 
 def config_for(path: str | pathlib.Path, method: str = "mil", preset: str = "fast", seed: int = 0) -> Config:
@@ -115,10 +119,9 @@ class RecordedRun(Run):
         ValueError: as `Run`; for a path that holds no data set; if no training task has enough demonstrations.
     """
 
-    metric = "score"
-
     def __init__(self, config: Config, workdir: str | pathlib.Path, console: Console | None = None):
         check_config(config)
+        self.metric = "success" if config.evaluation.gym else "score"
         self.data = DataSet(config.recorded.path)
         settings, train = config.recorded, config.train
         if bad := [i for i in settings.goal_indices if i >= self.data.header.state_size]:
@@ -163,6 +166,8 @@ class RecordedRun(Run):
         return read_vectors(self.data, self.shards.tasks, self.config.recorded.horizon)
 
     def _load(self) -> Training:
+        if make := self.config.evaluation.gym:
+            Client(make, self.config.evaluation.gym_python or sys.executable, 60.0).close()  # says if it cannot start
         with self.clock("demos"), self.phase("reading demonstrations"):
             state, action = self._vectors
             statistics = whitening.fit(jnp.asarray(state), jnp.asarray(action), self.config.method.whiten_actions)
@@ -185,7 +190,26 @@ class RecordedRun(Run):
         errors = self._errors(params, "validation")
         names = {"own_demo": "after", "other_demo": "other_task", "no_demo": "before"}
         heard = {name: _relative(errors, key) for name, key in names.items() if key in errors}
-        return 1 - heard["own_demo"], heard
+        score = 1 - heard["own_demo"]
+        if self.config.evaluation.gym is None:
+            return score, heard
+        return self._success(params, self.config.evaluation.gym), heard | {"score": score}
+
+    def _success(self, params: Params, make: str) -> float:
+        """Computes how often a policy is successful in the world of the validation tasks, at any time."""
+        policy, evaluation = Policy(self.method, self.spec, params, self.config), self.config.evaluation
+        outcomes = evaluate_in(
+            policy,
+            make,
+            tasks_of(self.data, "validation", policy),
+            controls=["own"],
+            episodes=evaluation.trials,
+            workers=evaluation.gym_workers,
+            python=evaluation.gym_python or sys.executable,
+        )
+        for loss in {outcome.lost for outcome in outcomes if outcome.lost}:
+            self._warn(f"an episode was lost: {loss}")
+        return float(np.mean([outcome.ever for outcome in outcomes]))
 
     def _judge(self, params: Params) -> tuple[dict[str, Any], Callable[[dict[str, Any]], None]]:
         with self.clock("evaluate"), self.phase("evaluating the policy"):
