@@ -142,8 +142,11 @@ def test_a_package_of_ones_own_is_found(tmp_path, monkeypatch):
 
 def test_flags_of_trials_are_refused_with_recorded_data():
     config = make_config(RECORDED, preset="cpu")
-    command_line._check_fields(["milx.train", "--config.evaluation.shots=2"], config)
-    for name in ("evaluation.trials", "train.redraw", "env.image_shape"):
+    for name in ("evaluation.shots=2", "evaluation.trials=2", "evaluation.gym=a:b"):
+        command_line._check_fields(["milx.train", f"--config.{name}"], config)
+    with pytest.raises(flags.Error, match="--config.evaluation.gym: expected only with --data; nothing reads it here"):
+        command_line._check_fields(["milx.train", "--config.evaluation.gym=a:b"], make_config("reach", preset="cpu"))
+    for name in ("evaluation.batch", "train.redraw", "env.image_shape"):
         with pytest.raises(flags.Error, match=f"--config.{name}: expected only without --data; nothing reads it here"):
             command_line._check_fields(["milx.train", f"--config.{name}=7"], config)
 
