@@ -144,7 +144,7 @@ def test_flags_of_trials_are_refused_with_recorded_data():
     config = make_config(RECORDED, preset="cpu")
     for name in ("evaluation.shots=2", "evaluation.trials=2", "evaluation.gym=a:b"):
         command_line._check_fields(["milx.train", f"--config.{name}"], config)
-    with pytest.raises(flags.Error, match="--config.evaluation.gym: expected only with --data; nothing reads it here"):
+    with pytest.raises(flags.Error, match=r"--config.evaluation.gym: expected only with --data; nothing reads it here"):
         command_line._check_fields(["milx.train", "--config.evaluation.gym=a:b"], make_config("reach", preset="cpu"))
     for name in ("evaluation.batch", "train.redraw", "env.image_shape"):
         with pytest.raises(flags.Error, match=f"--config.{name}: expected only without --data; nothing reads it here"):
