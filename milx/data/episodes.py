@@ -57,6 +57,11 @@ def define_flags(*, state: str, action: str, task: str) -> None:
     flags.DEFINE_string("state", state, "Where the robot's state is; empty for none.")
     flags.DEFINE_string("action", action, "Where the actions are; empty for none.")
     flags.DEFINE_string("task", task, "What makes a task: see above.")
+    define_split_flags()
+
+
+def define_split_flags() -> None:
+    """Defines the flags about images and splits that importers and recorders share."""
     flags.DEFINE_integer("height", 128, "Maximum number of rows of an image; larger ones are shrunk.", lower_bound=1)
     flags.DEFINE_float("validation", 0.1, "Fraction of the tasks that becomes validation tasks.")
     flags.DEFINE_float("test", 0.1, "Fraction of the tasks that becomes test tasks.")

@@ -7,7 +7,8 @@ dictionaries with "image", uint8 [H, W, 3], or "state", real numbers [S], or bot
 "agent_pos" mean the same. An array alone is an image if it looks like one, and a state otherwise.
 `info["is_success"]`, or else `info["success"]`, tells after every step whether the task is done. Actions are clipped to
 the environment's limits. An environment may have a method `demonstrate(seed)`, which returns a demonstration as a
-dictionary with the arrays "image", "state" and "action", [T, ...].
+dictionary with the arrays "image", "state" and "action", [T, ...], and raises an error if it fails. The module may have
+a function `tasks()`, which lists the names of all tasks.
 
 The process reads requests from standard input and writes a reply to each to standard output. Both are messages: four
 bytes, little-endian, hold the length of a JSON object; the object follows, and then the bytes of the arrays that its
@@ -19,6 +20,7 @@ bytes, little-endian, hold the length of a JSON object; the object follows, and 
 | {"do": "reset", "task": NAME, "seed": NUMBER} | | {} | the observation |
 | {"do": "step"} | "action" [A]; none for a random one | {"success": BOOL, "ended": BOOL} | the observation |
 | {"do": "demonstrate", "task": NAME, "seed": NUMBER} | | {} | the demonstration; none if the world shows none |
+| {"do": "tasks"} | | {"tasks": [NAME, ...]} | |
 
 A reply {"error": TEXT} says what went wrong. The process ends when its input ends.
 """
@@ -65,8 +67,8 @@ def receive(read):
 class World:
     """Answers requests with the environments that the user's function makes."""
 
-    def __init__(self, make):
-        self._make = make
+    def __init__(self, make, tasks):
+        self._make, self._tasks = make, tasks
         self._env = self._task = None
 
     def reset(self, task, seed):
@@ -95,6 +97,12 @@ class World:
         while env is not None and not hasattr(type(env), "demonstrate"):
             env = getattr(env, "env", None)
         return {}, {} if env is None else {name: np.asarray(value) for name, value in env.demonstrate(seed).items()}
+
+    def tasks(self):
+        """Lists the tasks."""
+        if self._tasks is None:
+            raise ValueError("tasks: missing, expected a function of this name beside the one that makes environments")
+        return {"tasks": list(self._tasks())}, {}
 
     def _of(self, task):
         if task != self._task or self._env is None:
@@ -127,7 +135,9 @@ def answer(world, header, arrays):
         return world.step(arrays.get("action"))
     if header["do"] == "demonstrate":
         return world.demonstrate(header["task"], header["seed"])
-    raise ValueError(f"do: got {header['do']!r}, expected reset, step or demonstrate")
+    if header["do"] == "tasks":
+        return world.tasks()
+    raise ValueError(f"do: got {header['do']!r}, expected reset, step, demonstrate or tasks")
 
 
 def main():
@@ -144,7 +154,8 @@ def main():
     try:
         module, _, name = sys.argv[1].partition(":")
         sys.path.insert(0, "")  # as `python -m` does
-        world = World(getattr(importlib.import_module(module), name))
+        found = importlib.import_module(module)
+        world = World(getattr(found, name), getattr(found, "tasks", None))
     except Exception:
         send(replies, {"error": traceback.format_exc()})
         return

@@ -165,7 +165,7 @@ def test_the_protocol_carries_arrays_of_every_type():
     np.testing.assert_array_equal(seen["state"], expected["agent_pos"])
     np.testing.assert_array_equal(seen["image"], expected["pixels"])
     assert seen["state"].dtype == np.float64
-    with pytest.raises(WorldError, match="do: got 'dance', expected reset, step or demonstrate"):
+    with pytest.raises(WorldError, match="do: got 'dance', expected reset, step, demonstrate or tasks"):
         client.ask({"do": "dance"})
 
 
