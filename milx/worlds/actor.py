@@ -12,15 +12,15 @@ from milx.types import Observation, TaskParams
 from milx.worlds.slot import Episode, Outcome, Task
 
 CONTROLS = {
-    "own": "adapted to the task's own demonstration",
-    "same_family": "adapted to another task of the same family",
-    "other_family": "adapted to a task of another family",
-    "unadapted": "not adapted",
-    "replay": "the actions of the demonstration, one after the other",
-    "mean_action": "the mean action of the demonstration",
+    "own": "its own demonstration",
+    "same_family": "another one's, same family",
+    "other_family": "another family's",
+    "unadapted": "no demonstration",
+    "replay": "the demonstration replayed",
+    "mean_action": "its mean action",
     "random": "random actions",
 }
-"""What acts, by name. All but the first are controls."""
+"""What acts, by name: the policy after a demonstration, or what stands beside it for comparison."""
 
 
 def other_tasks(tasks: Sequence[Task], number: int) -> dict[str, int]:

@@ -113,7 +113,7 @@ def table(found: dict[str, Any]) -> Table:
     """Draws a summary: a line for everything that acted, a column for every family."""
     families = list(next(iter(found.values()))["families"])
     shown = families if len(families) > 1 else []
-    drawn = Table("", "success at any time (95%)", "at the end (95%)", "episodes", *shown, title_justify="left")
+    drawn = Table("after", "success (95%)", "at the end (95%)", "episodes", *shown)
     for control, rates in found.items():
         lost = f", {rates['lost']} lost" if rates["lost"] else ""
         drawn.add_row(
@@ -136,7 +136,7 @@ def losses(outcomes: Iterable[Outcome], tasks: Sequence[Task]) -> list[str]:
 
 def _with_interval(rates: dict[str, Any], name: str) -> str:
     low, high = rates[f"{name}_wilson95"]
-    return f"{rates[name]:.1%} ({low:.1%} to {high:.1%})"
+    return f"{rates[name]:.1%} ({100 * low:.0f} to {100 * high:.0f})"
 
 
 def _of_family(rates: dict[str, Any], family: str) -> str:
