@@ -5,6 +5,9 @@
     demo = env.demonstrate()  # the same task in another scene: a policy adapts to this
     observation, reward, terminated, truncated, info = env.step(action)
 
+Importing this module registers the environments with Gymnasium, which then also makes them itself, as
+`gymnasium.make("milx/Push-v0")`, or without an import before, `gymnasium.make("milx.gym:milx/Push-v0")`.
+
 To run thousands of episodes at once, use the environment itself (`milx.make`) under `jax.vmap`.
 """
 
@@ -118,3 +121,10 @@ class GymEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         seen = self.env.observe(self._task, self._states[-1])
         values = {"image": seen.image, "state": seen.state}
         return {name: np.asarray(values[name], space.dtype) for name, space in self._seen.items()}
+
+
+IDS = {"reach": "milx/Reach-v0", "reach_state": "milx/ReachState-v0", "push": "milx/Push-v0", "place": "milx/Place-v0"}
+"""What Gymnasium calls milx's environments."""
+
+for _name, _id in IDS.items():
+    gymnasium.register(_id, entry_point="milx.gym:GymEnv", kwargs={"name": _name})

@@ -2,6 +2,7 @@
 
 import warnings
 
+import gymnasium
 import jax
 import numpy as np
 import pytest
@@ -25,6 +26,23 @@ def test_the_checker_of_gymnasium_is_content(gym_env):
         )
         warnings.filterwarnings("ignore", message=".*not able to test alternative render modes")
         check_env(gym_env, skip_render_check=False)
+
+
+def test_gymnasium_makes_them_itself():
+    """Makes a registered environment by its name; its episode is that of the class."""
+    made = gymnasium.make("milx.gym:milx/ReachState-v0", split="test")
+    alone = GymEnv("reach_state", split="test")
+    for env in (made, alone):
+        env.action_space.seed(0)
+    first, second = (env.reset(seed=3)[0]["state"] for env in (made, alone))
+    np.testing.assert_array_equal(first, second)
+    for _ in range(3):
+        (seen, reward, *_), (expected, theirs, *_) = (env.step(env.action_space.sample()) for env in (made, alone))
+        np.testing.assert_array_equal(seen["state"], expected["state"])
+        assert reward == theirs
+    with warnings.catch_warnings(action="ignore"):
+        check_env(made.unwrapped)
+    assert set(gym.IDS) == {"reach", "reach_state", "push", "place"} <= set(envs.ENVS)
 
 
 def test_an_episode_is_the_environments(gym_env):
