@@ -7,10 +7,11 @@ entry point in the group "milx.plugins":
     mine = "my_package"
 """
 
+import collections
 import importlib.metadata
 import pkgutil
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, MutableMapping
 from typing import Any, NamedTuple
 
 from milx.config.schema import Config, MethodConfig, NetworkConfig
@@ -39,7 +40,7 @@ class MethodEntry(NamedTuple):
     overrides: Overrides
 
 
-class _Classes(dict[str, Any]):
+class _Classes(collections.UserDict[str, Any]):
     """Classes by name; one that is registered as "module:class" is imported when it is first asked for."""
 
     def __getitem__(self, name: str) -> Any:
@@ -54,7 +55,7 @@ class _Classes(dict[str, Any]):
         return found
 
 
-ENVS: dict[str, Any] = _Classes()
+ENVS: MutableMapping[str, Any] = _Classes()
 """Classes of environments by name. They are called with an image shape (H, W) or None."""
 METHODS: dict[str, MethodEntry] = {}
 PRESETS: dict[str, dict[str, Overrides]] = {}
@@ -136,7 +137,7 @@ def load_plugins() -> None:
             warnings.warn(f"plugin {plugin.name} = {plugin.value}: {error!r}", RuntimeWarning, stacklevel=2)
 
 
-def _add(registry: dict[str, Any], kind: str, name: str, value: Any) -> None:
+def _add(registry: MutableMapping[str, Any], kind: str, name: str, value: Any) -> None:
     if name in registry:
         raise ValueError(f"{kind}: {name!r} is registered already, expected a name that is free")
     registry[name] = value

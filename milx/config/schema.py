@@ -225,6 +225,7 @@ class EvalConfig:
             errors of the actions.
         gym_python: the interpreter that runs it; None for this one.
         gym_workers: worlds at once.
+        gym_timeout: seconds that a world may take to answer.
     """
 
     validation_tasks: int = 100
@@ -236,6 +237,7 @@ class EvalConfig:
     gym: str | None = None
     gym_python: str | None = None
     gym_workers: int = 4
+    gym_timeout: float = 60.0
 
 
 @dataclasses.dataclass

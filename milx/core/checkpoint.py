@@ -86,9 +86,7 @@ class Checkpoints:
                 self._report(f"checkpoint of step {step}: its checksums could not be written: {error}")
                 return True
             kept = "there is none before it" if self.latest is None else f"the last good one is of step {self.latest}"
-            self._report(
-                f"checkpoint of step {step} could not be written, {kept}: {str(error).strip().splitlines()[0]}"
-            )
+            self._report(f"checkpoint of step {step} could not be written, {kept}: {_reason(error)}")
             return False
         return True
 
@@ -252,6 +250,14 @@ def _silenced() -> Iterator[None]:
         yield
     finally:
         logging.set_verbosity(before)
+
+
+def _reason(error: BaseException) -> str:
+    """Puts an error in one line: that of the operating system, if it comes from one."""
+    first: BaseException | None = error
+    while first is not None and not isinstance(first, OSError):
+        first = first.__cause__ or first.__context__
+    return str(first or error).strip().splitlines()[0]
 
 
 def _stored(x: Any) -> Any:

@@ -36,6 +36,9 @@ def unread_output() -> Iterator[None]:
     try:
         yield
     finally:
+        for stream in (sys.stdout, sys.stderr):
+            if stream:
+                stream.flush()  # at the exit of the process a failure would change its exit code
         sys.stdout, sys.stderr = before
 
 

@@ -21,9 +21,13 @@ class Stop:
     first one does, even while the main thread waits for a device. In an interactive session SIGINT raises
     KeyboardInterrupt there instead. Signals that were ignored before (by `nohup`, for example) remain so. A process
     that has been stopped exits with 128 plus the number of the signal, as a shell reports it.
+
+    Args:
+        message: what is said when a signal ends the process at once.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, message: str = "stopped") -> None:
+        self._message = message
         self.asked = 0
         """The number of the first signal; 0 before."""
         self._deferred = False
@@ -83,11 +87,18 @@ class Stop:
         again, self.asked = self.asked, self.asked or number
         if self._deferred and not (again and number == signal.SIGINT):
             if number == signal.SIGINT and not _is_interactive():
-                say("stopping after the updates under way; Ctrl-C again ends at once")
+                _say("stopping after the updates under way; Ctrl-C again ends at once")
         elif number != signal.SIGINT or not _is_interactive():
-            say("stopped; the same command goes on")
+            _say(self._message)
             # Threads that compile would keep a process alive that ends in the usual way.
             os._exit(128 + number)
+
+
+def _say(message: str) -> None:
+    """Says a message, for at most a second: nobody may read a pipe, and writing to it would take for ever."""
+    thread = threading.Thread(target=say, args=(message,), daemon=True)
+    thread.start()
+    thread.join(1.0)
 
 
 def _is_interactive() -> bool:

@@ -122,7 +122,7 @@ def write(
     for episode in episodes:
         tasks.setdefault(episode.task, []).append(episode)
     families = families or dict.fromkeys(tasks, "")
-    split_of = splits.choose(sorted(tasks), chosen) if chosen else splits.by_family(families, *held_out)
+    split_of = splits.choose(sorted(tasks), chosen) if chosen is not None else splits.by_family(families, *held_out)
     with Writer(out, *sizes, source) as writer:
         for name in track(sorted(tasks), "writing tasks"):
             own = tasks[name]

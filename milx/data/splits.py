@@ -34,10 +34,10 @@ def assign_splits(names: list[str], validation: float, test: float) -> dict[str,
 
 
 def by_family(families: Mapping[str, str], validation: float, test: float) -> dict[str, str]:
-    """Assigns a split to every task, to the same fractions of every family.
+    """Assigns a split to every task, as `assign_splits` does in every family by itself.
 
-    The tasks of a family that is too small to be split all train. If every family is, the tasks are split without
-    regard to families.
+    So a family holds out at least one task for validation and one for the test, if these are wanted. The tasks of a
+    family that is too small for that all train; if every family is, the tasks are split without regard to families.
 
     Args:
         families: by the names of tasks.
@@ -70,7 +70,7 @@ def choose(names: list[str], patterns: Mapping[str, list[str]]) -> dict[str, str
     split = dict.fromkeys(names, "train")
     for part, wanted in patterns.items():
         for pattern in wanted:
-            found = [name for name in names if fnmatch.fnmatchcase(name, pattern)]
+            found = [name for name in names if name == pattern or fnmatch.fnmatchcase(name, pattern)]
             if not found:
                 raise ValueError(f"splits: {part}: got {pattern!r}, expected a pattern that some task's name matches")
             for name in found:

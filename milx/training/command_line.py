@@ -135,7 +135,9 @@ def _check_fields(argv: Sequence[str], config: Config) -> None:
     known = assemble.fields(config)
     is_recorded = config.env_name == RECORDED
     unread = ("env.", "data.", "evaluation.", "train.redraw") if is_recorded else ("recorded.", "evaluation.gym")
-    worlds = [f"config.evaluation.{name}" for name in ("gym", "gym_python", "gym_workers", "shots", "trials")]
+    worlds = ["config.evaluation.shots", "config.evaluation.gym"]
+    if any(arg.lstrip("-").startswith("config.evaluation.gym=") for arg in argv):
+        worlds += [f"config.evaluation.{name}" for name in ("gym_python", "gym_workers", "gym_timeout", "trials")]
     for arg in argv[1:]:
         name = arg.lstrip("-").split("=")[0]
         read = not name.removeprefix("config.").startswith(unread) or (is_recorded and name in worlds)

@@ -122,6 +122,8 @@ class RecordedRun(Run):
     def __init__(self, config: Config, workdir: str | pathlib.Path, console: Console | None = None):
         check_config(config)
         self.metric = "success" if config.evaluation.gym else "score"
+        if config.evaluation.gym and jax.process_count() > 1:
+            raise ValueError(f"evaluation.gym: got {config.evaluation.gym}, expected None on several hosts")
         self.data = DataSet(config.recorded.path)
         settings, train = config.recorded, config.train
         if bad := [i for i in settings.goal_indices if i >= self.data.header.state_size]:
@@ -167,7 +169,8 @@ class RecordedRun(Run):
 
     def _load(self) -> Training:
         if make := self.config.evaluation.gym:
-            Client(make, self.config.evaluation.gym_python or sys.executable, 60.0).close()  # says if it cannot start
+            evaluation = self.config.evaluation  # says now if the world cannot be started
+            Client(make, evaluation.gym_python or sys.executable, evaluation.gym_timeout).close()
         with self.clock("demos"), self.phase("reading demonstrations"):
             state, action = self._vectors
             statistics = whitening.fit(jnp.asarray(state), jnp.asarray(action), self.config.method.whiten_actions)
@@ -206,6 +209,7 @@ class RecordedRun(Run):
             episodes=evaluation.trials,
             workers=evaluation.gym_workers,
             python=evaluation.gym_python or sys.executable,
+            timeout=evaluation.gym_timeout,
         )
         for loss in {outcome.lost for outcome in outcomes if outcome.lost}:
             self._warn(f"an episode was lost: {loss}")

@@ -120,7 +120,7 @@ class Run(abc.ABC):
                 not be written, or `loop.MOST_IN_VAIN` updates in a row were skipped because they were not finite.
             SystemExit: after a signal, with 128 plus its number.
         """
-        stop = signals.Stop()
+        stop = signals.Stop("stopped; the same command goes on")
         with files.locked(self.folder / "lock"), stop.listen():
             self._claim_folder()  # another process may have written its own configuration before this one had the lock
             self._train(stop)

@@ -74,8 +74,6 @@ class Actor:
             return np.asarray(shown[min(outcome.steps, len(shown) - 1)])
         if outcome.episode.control == "mean_action":
             return np.mean(shown, axis=0)
-        if not np.isfinite(action).all():
-            raise ValueError(f"action: got {action} in {outcome.episode}, expected finite numbers")
         return action
 
     def _learn(self, source: int | None) -> TaskParams:

@@ -77,12 +77,14 @@ class Client:
     def _receive(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         deadline, output = time.monotonic() + self._timeout, self._process.stdout
         assert output is not None
+        ready = select.poll()
+        ready.register(output, select.POLLIN)
 
         def read(size: int) -> bytes:
             parts: list[bytes] = []
             while size:
                 left = deadline - time.monotonic()
-                if left <= 0 or not select.select([output], [], [], left)[0]:
+                if left <= 0 or not ready.poll(1000 * left):
                     self._fail(f"has not answered within {self._timeout:g} s")
                 part = os.read(output.fileno(), min(size, 1 << 20))
                 if not part:
@@ -91,7 +93,13 @@ class Client:
                 size -= len(part)
             return b"".join(parts)
 
-        header, arrays = worker.receive(read)
+        try:
+            header, arrays = worker.receive(read)
+        except WorldError:
+            raise
+        except Exception as error:  # what came is no message
+            self.close()
+            raise WorldError(f"{self._make}: expected a message of the protocol: {error!r:.200}") from error
         if "error" in header:
             self.close()
             raise WorldError(f"{self._make}: {header['error'].strip()[-_TAIL:]}")

@@ -12,7 +12,7 @@ from milx.core.progress import advance
 from milx.data.dataset import DataSet
 from milx.deploy.policy import Policy
 from milx.worlds.actor import CONTROLS, Actor
-from milx.worlds.client import Client
+from milx.worlds.client import Client, WorldError
 from milx.worlds.slot import Episode, Outcome, Slot, Task
 
 
@@ -51,6 +51,7 @@ def evaluate_in(
     python: str = sys.executable,
     timeout: float = 60.0,
     max_steps: int = 1000,
+    film: int = 0,
 ) -> list[Outcome]:
     """Runs episodes of every task with the policy and with controls.
 
@@ -66,39 +67,57 @@ def evaluate_in(
         python: the interpreter that runs the world.
         timeout: seconds that a world may take to answer. One that has not answered is ended, and its episode lost.
         max_steps: after which an episode ends, if the world does not end it.
+        film: number of tasks for whose first episode after their own demonstrations the images are kept.
 
     Returns:
         What became of all episodes, in the order of tasks, controls and seeds.
 
     Raises:
-        WorldError: if the world cannot be started, or cannot demonstrate a task.
+        WorldError: if the world cannot be started, cannot demonstrate a task, or has lost all of the first episodes.
         ValueError: for a control that does not exist.
     """
     if unknown := sorted(set(controls) - set(CONTROLS)):
         raise ValueError(f"controls: got {unknown[0]!r}, expected some of {', '.join(CONTROLS)}")
+    controls = tuple(dict.fromkeys(controls))
     connect = functools.partial(Client, make, python, timeout)
-    slots = [Slot(connect, policy.spec, max_steps, seed) for _ in range(workers)]
-    try:
-        with ThreadPoolExecutor(workers) as pool:
+    slots = [Slot(connect, policy.spec, max_steps) for _ in range(workers)]
+    with ThreadPoolExecutor(workers) as pool:
+        try:
             list(pool.map(Slot.connect, slots))
             tasks = [slots[0].demonstrated(task, (seed - 1) % 2**31) for task in tasks]
             actor = Actor(policy, tasks, workers)
             possible = itertools.product(range(len(tasks)), controls, range(episodes))
             planned = [Episode(control, task, seed + i) for task, control, i in possible if actor.can(control, task)]
-            waiting, outcomes = collections.deque(planned), dict[Episode, Outcome]()
-            while len(outcomes) < len(planned):
-                for number, slot in enumerate(slots):
-                    if slot.outcome is None and waiting:
-                        slot.outcome = Outcome(waiting.popleft())
-                        actor.assign(number, slot.outcome.episode)
-                list(pool.map(lambda slot: slot.begin(tasks), slots))
-                actions = actor.act([slot.observation for slot in slots], [slot.outcome for slot in slots])
-                list(pool.map(Slot.step, slots, actions))
-                for slot in slots:
-                    if slot.outcome is not None and slot.is_over:
-                        outcomes[slot.outcome.episode], slot.outcome = slot.outcome, None
-                        advance(1)
-    finally:
+            filmed = {Episode("own", number, seed) for number in range(film)}
+            waiting = [Outcome(episode, images=[] if episode in filmed else None) for episode in planned]
+            return _run(pool, slots, actor, tasks, waiting)
+        finally:  # before the pool waits for what the worlds are asked
+            for slot in slots:
+                slot.close()
+
+
+def _run(
+    pool: ThreadPoolExecutor, slots: list[Slot], actor: Actor, tasks: Sequence[Task], outcomes: list[Outcome]
+) -> list[Outcome]:
+    """Runs the episodes of `outcomes`, as many at once as there are slots, and returns them.
+
+    Raises:
+        WorldError: if all of the first ones, at least ten, are lost.
+    """
+    waiting, ended = collections.deque(outcomes), list[Outcome]()
+    while len(ended) < len(outcomes):
+        for number, slot in enumerate(slots):
+            if slot.outcome is None and waiting:
+                slot.outcome = waiting.popleft()
+                actor.assign(number, slot.outcome.episode)
+        list(pool.map(lambda slot: slot.begin(tasks), slots))
+        actions = actor.act([slot.observation for slot in slots], [slot.outcome for slot in slots])
+        list(pool.map(Slot.step, slots, actions))
         for slot in slots:
-            slot.close()
-    return [outcomes[episode] for episode in planned]
+            if slot.outcome is not None and slot.is_over:
+                ended.append(slot.outcome)
+                slot.outcome = None
+                advance(1)
+        if max(10, 2 * len(slots)) <= len(ended) and all(outcome.lost for outcome in ended):
+            raise WorldError(f"all of the first {len(ended)} episodes were lost: {ended[0].lost}")
+    return outcomes

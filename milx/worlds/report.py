@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from milx.config import assemble
 from milx.config.schema import Config
@@ -23,6 +24,8 @@ from milx.worlds.slot import Outcome, Task
 
 FILE, VIDEO = "gym.json", "gym.gif"
 """The files in the run's folder."""
+_FILMED = 3
+"""Tasks in the video."""
 
 
 def report_on(config: Config, folder: pathlib.Path, make: str, console: Console | None = None, **options: Any) -> None:
@@ -43,11 +46,8 @@ def report_on(config: Config, folder: pathlib.Path, make: str, console: Console 
     console, policy = console or Console(), load_run(folder)
     tasks = tasks_of(DataSet(config.recorded.path), "test", policy)
     with progress.phase(console, f"acting in {make}"):
-        outcomes = evaluate_in(policy, make, tasks, **options)
+        outcomes = evaluate_in(policy, make, tasks, film=_FILMED, **options)
     found = summarize(outcomes, tasks)
-    console.print(table(found))
-    for loss in losses(outcomes, tasks):
-        console.print(f"lost: {printable(loss)}", markup=False, highlight=False)
     files.write_json(
         folder / FILE,
         {
@@ -63,9 +63,12 @@ def report_on(config: Config, folder: pathlib.Path, make: str, console: Console 
     filmed = [outcome for outcome in outcomes if outcome.images]
     if filmed:
         demos = [np.asarray(tasks[outcome.episode.task].demos[0].image) for outcome in filmed]
-        trials = [np.stack(outcome.images) for outcome in filmed]
+        trials = [np.stack(outcome.images or []) for outcome in filmed]
         longest = max(map(len, demos + trials))
         side_by_side(_same_length(demos, longest), _same_length(trials, longest), folder / VIDEO)
+    console.print(table(found))
+    for loss in losses(outcomes, tasks):
+        console.print(f"lost: {printable(loss)}", markup=False, highlight=False)
 
 
 def summarize(outcomes: Sequence[Outcome], tasks: Sequence[Task]) -> dict[str, Any]:
@@ -113,7 +116,9 @@ def table(found: dict[str, Any]) -> Table:
     """Draws a summary: a line for everything that acted, a column for every family."""
     families = list(next(iter(found.values()))["families"])
     shown = families if len(families) > 1 else []
-    drawn = Table("after", "success (95%)", "at the end (95%)", "episodes", *shown)
+    drawn = Table("after", "success (95%)", "at the end (95%)", "episodes")
+    for family in shown:
+        drawn.add_column(Text(printable(family)))
     for control, rates in found.items():
         lost = f", {rates['lost']} lost" if rates["lost"] else ""
         drawn.add_row(

@@ -44,7 +44,7 @@ class Outcome:
         end: whether it was done at the end.
         steps: how many were done.
         lost: why the episode could not be finished; None if it was. It does not count as a success.
-        images: [H, W, 3] uint8 each, what was seen in a task's first episode after its own demonstrations.
+        images: [H, W, 3] uint8 each, what was seen, of an episode that is filmed; else None.
     """
 
     episode: Episode
@@ -52,14 +52,14 @@ class Outcome:
     end: bool = False
     steps: int = 0
     lost: str | None = None
-    images: list[np.ndarray] = dataclasses.field(default_factory=list)
+    images: list[np.ndarray] | None = None
 
 
 class Slot:
     """One of the worlds that run side by side, and the episode in it."""
 
-    def __init__(self, connect: Callable[[], Client], spec: Spec, max_steps: int, first_seed: int):
-        self._connect, self._spec, self._max_steps, self._first_seed = connect, spec, max_steps, first_seed
+    def __init__(self, connect: Callable[[], Client], spec: Spec, max_steps: int):
+        self._connect, self._spec, self._max_steps = connect, spec, max_steps
         self._client: Client | None = None
         self.outcome: Outcome | None = None
         self.is_over = True
@@ -93,12 +93,11 @@ class Slot:
         _, task, seed = self.outcome.episode
         try:
             self.connect()
-            seen = self._ask({"do": "reset", "task": tasks[task].name, "seed": seed})[1]
+            self._see(self._ask({"do": "reset", "task": tasks[task].name, "seed": seed})[1])
         except WorldError as error:
             self._lose(error)
             return
         self.is_over = False
-        self._see(seen)
 
     def step(self, action: np.ndarray | None) -> None:
         """Does one step, if there is an episode; a random one without an action."""
@@ -106,7 +105,10 @@ class Slot:
         if outcome is None or self.is_over:
             return
         try:
+            if action is not None and not np.isfinite(action).all():
+                raise WorldError(f"the policy's action is {action}, expected finite numbers")
             header, seen = self._ask({"do": "step"}, **({} if action is None else {"action": action}))
+            self._see(seen)
         except WorldError as error:
             self._lose(error)
             return
@@ -114,7 +116,6 @@ class Slot:
         outcome.end = header["success"]
         outcome.ever |= outcome.end
         self.is_over = header["ended"] or outcome.steps >= self._max_steps
-        self._see(seen)
 
     def _ask(self, request: dict[str, Any], **arrays: np.ndarray) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         assert self._client is not None
@@ -123,22 +124,28 @@ class Slot:
     def _lose(self, error: WorldError) -> None:
         assert self.outcome is not None
         self.outcome.lost, self.outcome.ever, self.outcome.end = str(error), False, False
-        self._client, self.is_over = None, True
+        self.close()
+        self.is_over = True
 
     def _see(self, arrays: dict[str, np.ndarray]) -> None:
-        self.observation = check_observation(Observation(*_parts(arrays, self._spec)), self._spec)
+        """Takes what the policy sees; other sizes than the policy's are an error that ends the evaluation."""
+        image, state = _parts(arrays, self._spec)
+        if state is not None and not np.isfinite(state).all():
+            raise WorldError(f"the state is {state}, expected finite numbers")
+        self.observation = check_observation(Observation(image, state), self._spec)
         assert self.outcome is not None
-        if self.outcome.episode[::2] == ("own", self._first_seed) and self.observation.image is not None:
-            self.outcome.images.append(np.asarray(self.observation.image))
+        if self.outcome.images is not None and image is not None:
+            self.outcome.images.append(image)
 
 
 def _parts(arrays: dict[str, np.ndarray], spec: Spec) -> tuple[np.ndarray | None, np.ndarray | None]:
     """Takes what a policy sees out of an observation or a demonstration; larger images are shrunk as at import."""
     image, state = arrays.get("image"), arrays.get("state")
     if (
-        image is not None
-        and spec.image_shape is not None
-        and shrunk(image.shape[-3:], spec.image_shape[0]) == (spec.image_shape)
+        spec.image_shape is not None
+        and image is not None
+        and (image.ndim >= 3 and image.shape[-1] == 3 and image.dtype == np.uint8)
+        and shrunk(image.shape[-3:], spec.image_shape[0]) == spec.image_shape
     ):
         frames = image.reshape(-1, *image.shape[-3:])
         image = np.stack(list(resized(iter(frames), spec.image_shape))).reshape(*image.shape[:-3], *spec.image_shape, 3)

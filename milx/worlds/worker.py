@@ -5,10 +5,10 @@
 `function(task)` returns a Gymnasium environment in which the task of that name is to be done. Its observations are
 dictionaries with "image", uint8 [H, W, 3], or "state", real numbers [S], or both; LeRobot's names "pixels" and
 "agent_pos" mean the same. An array alone is an image if it looks like one, and a state otherwise.
-`info["is_success"]`, or else `info["success"]`, tells after every step whether the task is done. Actions are clipped to
-the environment's limits. An environment may have a method `demonstrate(seed)`, which returns a demonstration as a
-dictionary with the arrays "image", "state" and "action", [T, ...], and raises an error if it fails. The module may have
-a function `tasks()`, which lists the names of all tasks.
+`info["is_success"]`, or else `info["success"]`, tells after every step whether the task is done. Actions are those of a
+`gymnasium.spaces.Box`, to whose limits they are clipped. An environment may have a method `demonstrate(seed)`, which
+returns a demonstration as a dictionary with the arrays "image", "state" and "action", [T, ...], and raises an error if
+it fails. The module may have a function `tasks()`, which lists the names of all tasks.
 
 The process reads requests from standard input and writes a reply to each to standard output. Both are messages: four
 bytes, little-endian, hold the length of a JSON object; the object follows, and then the bytes of the arrays that its
@@ -28,8 +28,11 @@ A reply {"error": TEXT} says what went wrong. The process ends when its input en
 import importlib
 import json
 import os
+import signal
 import struct
 import sys
+import threading
+import time
 import traceback
 
 import numpy as np
@@ -81,10 +84,7 @@ class World:
     def step(self, action):
         """Does one step, with a random action if there is none."""
         env = self._of(self._task)
-        if action is None:
-            action = env.action_space.sample()
-        elif hasattr(env.action_space, "low"):
-            action = np.clip(action, env.action_space.low, env.action_space.high).astype(env.action_space.dtype)
+        action = env.action_space.sample() if action is None else _within(action, env.action_space)
         observation, _, terminated, truncated, info = env.step(action)
         success = info.get("is_success", info.get("success"))
         if success is None:
@@ -104,12 +104,25 @@ class World:
             raise ValueError("tasks: missing, expected a function of this name beside the one that makes environments")
         return {"tasks": list(self._tasks())}, {}
 
+    def close(self):
+        """Closes the environment."""
+        if self._env is not None:
+            self._env.close()
+
     def _of(self, task):
         if task != self._task or self._env is None:
             if self._env is not None:
                 self._env.close()
             self._env, self._task = self._make(task), task
         return self._env
+
+
+def _within(action, space):
+    """Clips an action to a space's limits, in its type."""
+    if not hasattr(space, "low") or space.shape != action.shape:
+        raise ValueError(f"action: got {list(action.shape)}, expected actions of {space}, a box of the same shape")
+    action = np.clip(action, space.low, space.high)
+    return (np.rint(action) if np.issubdtype(space.dtype, np.integer) else action).astype(space.dtype)
 
 
 def _seen(observation):
@@ -121,7 +134,12 @@ def _seen(observation):
     for part, names in NAMES.items():
         for name in names:
             if name in observation and part not in found:
-                found[part] = np.asarray(observation[name])
+                value = observation[name]
+                if isinstance(value, dict):
+                    if len(value) != 1:
+                        raise ValueError(f"{name}: has {sorted(value)}, expected one camera")
+                    (value,) = value.values()
+                found[part] = np.asarray(value)
     if not found:
         raise ValueError(f"observation: has {sorted(observation)}, expected image, state or both")
     return found
@@ -140,10 +158,26 @@ def answer(world, header, arrays):
     raise ValueError(f"do: got {header['do']!r}, expected reset, step, demonstrate or tasks")
 
 
+def _outlive_nobody(parent):
+    """Ends the process, and all that it has started, when the one that has started it has ended."""
+    while os.getppid() == parent:
+        time.sleep(1.0)
+    _end()
+
+
+def _end():
+    if os.getpid() == os.getpgrp():  # as the client starts it
+        os.killpg(0, signal.SIGKILL)
+    os._exit(0)
+
+
 def main():
     """Answers requests until there are no more."""
-    requests, replies = sys.stdin.buffer, os.fdopen(os.dup(sys.stdout.fileno()), "wb")
-    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # what the world prints must not end up among the replies
+    # What the world prints must not end up among the replies, and it must not read requests.
+    requests, replies = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
+    os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+    os.dup2(2, 1)
+    threading.Thread(target=_outlive_nobody, args=(os.getppid(),), daemon=True).start()
 
     def read(size):
         content = requests.read(size)
@@ -153,7 +187,7 @@ def main():
 
     try:
         module, _, name = sys.argv[1].partition(":")
-        sys.path.insert(0, "")  # as `python -m` does
+        sys.path[0] = ""  # as `python -m` does, in the place of this file's folder
         found = importlib.import_module(module)
         world = World(getattr(found, name), getattr(found, "tasks", None))
     except Exception:
@@ -164,6 +198,8 @@ def main():
         try:
             header, arrays = receive(read)
         except EOFError:
+            world.close()
+            _end()
             return
         try:
             reply = answer(world, header, arrays)

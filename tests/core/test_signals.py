@@ -17,7 +17,9 @@ def start(program, *arguments):
     """Starts a Python program that ignores no signal, whatever this process ignores."""
     command = [sys.executable, "-c", textwrap.dedent(program), *map(str, arguments)]
     defaults = lambda: [signal.signal(number, signal.SIG_DFL) for number in SIGNALS]  # noqa: E731
-    return subprocess.Popen(command, stdout=subprocess.PIPE, text=True, preexec_fn=defaults)
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    return subprocess.Popen(command, **pipes, preexec_fn=defaults, env=environment)
 
 
 NUMBERS = pytest.mark.parametrize("number", SIGNALS, ids=lambda number: number.name)
@@ -65,7 +67,7 @@ def test_elsewhere_the_signal_ends_the_process_at_once_with_its_exit_code(number
     out, _ = process.communicate()
     assert time.monotonic() - began < 10
     assert process.returncode == 128 + number
-    assert "the same command goes on" in out
+    assert out.splitlines()[-1] == "milx: stopped"
 
 
 def test_a_second_interrupt_ends_the_process_at_once_even_where_the_first_is_deferred():
@@ -121,22 +123,45 @@ def test_a_terminal_that_closes_stops_the_process_in_order(deferred):
     assert os.waitstatus_to_exitcode(status) == (229 if "stop" in deferred else 129)
 
 
-def test_a_closed_pipe_does_not_end_a_command():
+@pytest.mark.parametrize("deferred", [True, False])
+def test_a_pipe_that_nobody_reads_does_not_keep_the_process_alive(deferred):
+    """Fills the pipe of the output; then one signal, or two where the first is deferred, end the process."""
+    program = f"""
+    import contextlib, os, threading, time
+    from milx.core import signals
+    stop = signals.Stop()
+    with stop.listen(), stop.deferred() if {deferred} else contextlib.nullcontext():
+        print("ready", flush=True)
+        threading.Thread(target=os.write, args=(1, b"x" * 2**20), daemon=True).start()
+        time.sleep(60)
+    """
+    process = start(program)
+    assert process.stdout.readline() == "ready\n"
+    time.sleep(0.3)
+    for _ in range(1 + deferred):
+        process.send_signal(signal.SIGINT)
+        time.sleep(0.3)
+    assert process.wait(10) == 130
+
+
+@pytest.mark.parametrize("lines", [1, 200])
+def test_a_closed_pipe_does_not_end_a_command(lines):
     """Reads one line of a process and closes the pipe; the process goes on to its end."""
-    program = """
-    import sys, time
+    program = f"""
+    import sys
     from milx.core import commands
     with commands.command():
         print("ready", flush=True)
-        for _ in range(20):
-            time.sleep(0.05)
-            print("x" * 10_000)
-        sys.exit(7)
+        sys.stdin.readline()
+        for _ in range({lines}):
+            print("x" * 1000)
+    sys.exit(7)
     """
     process = start(program)
     assert process.stdout.readline() == "ready\n"
     process.stdout.close()
-    assert process.wait() == 7
+    process.communicate("closed\n")
+    assert process.returncode == 7
 
 
 def test_signals_that_were_ignored_stay_ignored():

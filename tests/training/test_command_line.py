@@ -142,8 +142,11 @@ def test_a_package_of_ones_own_is_found(tmp_path, monkeypatch):
 
 def test_flags_of_trials_are_refused_with_recorded_data():
     config = make_config(RECORDED, preset="cpu")
-    for name in ("evaluation.shots=2", "evaluation.trials=2", "evaluation.gym=a:b"):
-        command_line._check_fields(["milx.train", f"--config.{name}"], config)
+    command_line._check_fields(["milx.train", "--config.evaluation.shots=2"], config)
+    given = ["--config.evaluation.gym=a:b", "--config.evaluation.trials=2", "--config.evaluation.gym_workers=2"]
+    command_line._check_fields(["milx.train", *given], config)
+    with pytest.raises(flags.Error, match=r"--config.evaluation.trials: expected only without --data"):
+        command_line._check_fields(["milx.train", *given[1:]], config)
     with pytest.raises(flags.Error, match=r"--config.evaluation.gym: expected only with --data; nothing reads it here"):
         command_line._check_fields(["milx.train", "--config.evaluation.gym=a:b"], make_config("reach", preset="cpu"))
     for name in ("evaluation.batch", "train.redraw", "env.image_shape"):

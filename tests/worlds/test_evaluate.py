@@ -3,9 +3,12 @@
 import dataclasses
 import io
 import json
+import os
 import pathlib
 import re
+import subprocess
 import sys
+import textwrap
 import time
 
 import jax.numpy as jnp
@@ -51,6 +54,21 @@ class Follower(Method):
 
     def initial_memory(self, key):
         return jnp.zeros(())
+
+
+class Wide(Follower):
+    """Has an action too many."""
+
+    def act(self, task_params, observation, memory):
+        return jnp.zeros(3), memory
+
+
+class Watcher(Follower):
+    """Does as much as the brightness of the left and of the right half of its picture says."""
+
+    def act(self, task_params, observation, memory):
+        left, right = observation.image[:, :15].mean(), observation.image[:, 15:].mean()
+        return jnp.stack([left, right]) / 1000 - 0.1, memory
 
 
 @pytest.fixture
@@ -130,6 +148,61 @@ def test_worlds_that_fail_cost_their_episodes_and_are_reported(policy):
     assert "ZeroDivisionError: the world's own error" in lost[3]
 
 
+def test_a_state_that_is_not_finite_costs_its_episode(policy):
+    demo = Demo(state=np.ones((6, 2)), action=np.zeros((6, 2)))
+    outcomes = evaluate_in(
+        policy,
+        "point_world:make_diverging",
+        [Task("near/right", "", (demo,))],
+        controls=["own", "own"],
+        episodes=4,
+        workers=2,
+    )
+    assert [outcome.end for outcome in outcomes] == [False, True, False, True]
+    assert [outcome.steps for outcome in outcomes] == [2, point_world.LENGTH] * 2
+    assert re.fullmatch(r"the state is \[nan nan\], expected finite numbers", outcomes[0].lost)
+
+
+def test_a_world_that_loses_every_episode_ends_the_evaluation(policy):
+    demo = Demo(state=np.ones((6, 2)), action=np.zeros((6, 2)))
+    tasks = [Task("near/right", "", (demo,))]
+    with pytest.raises(WorldError, match=r"(?s)all of the first 1\d episodes were lost: .*neither is_success"):
+        evaluate_in(policy, "point_world:make_pictured", tasks, controls=["own"], episodes=12, workers=2)
+    wide = dataclasses.replace(policy, method=Wide())
+    with pytest.raises(WorldError, match=r"action: got \[3\], expected actions of Box\(.*\), a box of the same shape"):
+        evaluate_in(wide, "point_world:make", tasks, controls=["own"], episodes=12, workers=2)
+
+
+def test_nothing_is_left_of_a_world_when_the_process_that_evaluates_is_told_to_stop(tmp_path):
+    """Sends SIGTERM while a world hangs that has started a process: both have ended soon after."""
+    program = """
+    import numpy as np
+    from milx.core.commands import command
+    from milx.worlds.client import Client
+    with command():
+        client = Client("point_world:make_parent", __import__("sys").executable, 600.0)
+        client.ask({"do": "reset", "task": "near/left", "seed": 0})
+        client.ask({"do": "step"}, action=np.zeros(2))
+    """
+    said = tmp_path / "children"
+    environment = {**os.environ, "POINT_WORLD_CHILDREN": str(said)}
+    process = subprocess.Popen([sys.executable, "-c", textwrap.dedent(program)], env=environment)
+    try:
+        wait_for(lambda: said.is_file() and len(said.read_text().split()) == 2)
+        process.terminate()
+        assert process.wait(10) == 143
+        wait_for(lambda: not any(pathlib.Path(f"/proc/{number}/exe").exists() for number in said.read_text().split()))
+    finally:
+        process.kill()
+
+
+def wait_for(condition):
+    end = time.monotonic() + 20
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
 def test_worlds_that_cannot_be_started_say_why(policy):
     for make, message in (
         ("no_such_module:make", "No module named 'no_such_module'"),
@@ -144,19 +217,29 @@ def test_worlds_that_cannot_be_started_say_why(policy):
 
 
 def test_larger_pictures_are_shrunk_and_other_ones_refused(policy):
+    """Acts by what is seen: the episode is that of a loop which computes the brightness of the whole picture."""
     spec = dataclasses.replace(policy.spec, image_shape=(20, 30))
     demo = Demo(np.zeros((6, 20, 30, 3), np.uint8), np.zeros((6, 2)), np.zeros((6, 2)))
     tasks = [Task("near/left", "near", (demo,))]
-    seeing = dataclasses.replace(policy, spec=spec)
-    (outcome,) = evaluate_in(seeing, "point_world:make_pictured", tasks, controls=["own"], episodes=1, workers=1)
-    assert "info: has neither is_success nor success" in outcome.lost
+    seeing = dataclasses.replace(policy, spec=spec, method=Watcher())
+    (outcome,) = evaluate_in(
+        seeing, "point_world:make_pictured_well", tasks, controls=["own"], episodes=1, workers=1, film=1
+    )
+    world = point_world.Pictured("near/left")
+    picture = world.reset(seed=0)[0]["pixels"]
+    for seen in outcome.images[:-1]:
+        np.testing.assert_array_equal(seen[:, [0, -1]], picture[::2][:, [0, -1]])
+        action = np.array([picture[:, :30].mean(), picture[:, 30:].mean()]) / 1000 - 0.1
+        picture = world.step(action.astype(np.float32))[0]["pixels"]
+    assert len(outcome.images) == point_world.LENGTH + 1
+    assert len(np.unique(np.stack(outcome.images))) > 5
     other = dataclasses.replace(policy, spec=dataclasses.replace(spec, image_shape=(20, 20)))
     square = [Task("near/left", "near", (dataclasses.replace(demo, image=demo.image[:, :, :20]),))]
     with pytest.raises(ValueError, match=r"observation.image: got shape \[40, 60, 3\], expected \[20, 20, 3\]"):
         evaluate_in(other, "point_world:make_pictured", square, controls=["random"], episodes=1, workers=1)
 
 
-def test_the_protocol_carries_arrays_of_every_type():
+def test_anybody_can_speak_the_protocol():
     """Asks the world's process itself, as a policy of somebody else's would."""
     client = Client("point_world:make_pictured", sys.executable, 60)
     _, seen = client.ask({"do": "reset", "task": "near/left", "seed": 5})
@@ -190,7 +273,7 @@ def test_a_run_is_evaluated_in_the_world_whose_tasks_its_data_set_names(policy, 
 
 
 def test_lost_episodes_count_as_episodes_without_success():
-    tasks = [Task("a", "one"), Task("b", "two")]
+    tasks = [Task("a", "[/one]"), Task("b", "two\x1b[31m")]
     outcomes = [
         Outcome(Episode("own", 0, 0), ever=True, end=True, steps=4),
         Outcome(Episode("own", 0, 1), ever=True, end=False, steps=6),
@@ -204,7 +287,10 @@ def test_lost_episodes_count_as_episodes_without_success():
     assert (own["ever"], own["end"]) == (pytest.approx(2 / 3), pytest.approx(1 / 3))
     assert own["ever_wilson95"] == wilson_interval(2, 3)
     assert {name: (rates["episodes"], rates["ever"]) for name, rates in own["families"].items()} == {
-        "one": (2, 1.0),
-        "two": (1, 0.0),
+        "[/one]": (2, 1.0),
+        "two\x1b[31m": (1, 0.0),
     }
+    console = Console(file=io.StringIO(), width=200)
+    console.print(report.table(found))
+    assert "[/one]" in console.file.getvalue() and "two\\x1b[31m" in console.file.getvalue()
     assert report.losses(outcomes, tasks) == ["b, own, seed 0: it has ended"]
