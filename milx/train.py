@@ -1,6 +1,6 @@
 """Plans or reads demonstrations, meta-trains a policy on them, and evaluates it on held-out tasks.
 
-A run that is started again with the same flags continues where it stopped.
+A run that is started again with the same flags continues where it stopped; with a larger train.steps it is extended.
 
     python -m milx.train --env=reach
     python -m milx.train --env=reach --preset=paper --seed=1 --config.train.meta_batch=25

@@ -36,6 +36,9 @@ from milx.training.state import Training, check_steps, initial_state, parse_extr
 from milx.training.update import Sample, Trainer, TrainState, compile_in_background, make_optimizer
 from milx.types import Params, Spec
 
+_ANYWHERE = ("gym_python", "gym_workers", "gym_timeout")
+"""Fields of `config.evaluation` that may change between two starts of a run: they say where, not what, to evaluate."""
+
 
 def _describe_skipped(values: dict[str, float], step: int) -> str:
     task = int(values["bad_task"])
@@ -112,6 +115,8 @@ class Run(abc.ABC):
     def train(self) -> None:
         """Meta-trains to the configured number of steps, from the latest checkpoint if there is one.
 
+        A run may be given more steps than it began with. The learning rate is then that of the longer schedule.
+
         On SIGTERM, SIGINT or SIGHUP it writes a checkpoint after the scan under way, which is not validated, and ends
         the process; during a validation, before which there is a checkpoint, it ends at once (see `signals.Stop`).
 
@@ -122,7 +127,7 @@ class Run(abc.ABC):
         """
         stop = signals.Stop("stopped; the same command goes on")
         with files.locked(self.folder / "lock"), stop.listen():
-            self._claim_folder()  # another process may have written its own configuration before this one had the lock
+            self._claim_folder(extend=True)  # another process may have written its own configuration before
             self._train(stop)
 
     def _train(self, stop: signals.Stop) -> None:
@@ -230,14 +235,23 @@ class Run(abc.ABC):
             self.console.print(f"continuing from step {int(state.step)}")
         return state, batch_key
 
-    def _claim_folder(self) -> None:
-        """Writes the configuration, or checks that the folder's is the same."""
+    def _claim_folder(self, extend: bool = False) -> None:
+        """Writes the configuration, or checks that the folder's is the same but for more updates and _ANYWHERE.
+
+        Args:
+            extend: whether to write these.
+        """
         path = self.folder / "config.json"
         mine = assemble.to_dict(self.config)
-        if path.is_file():
-            theirs = assemble.to_dict(assemble.read(path))
-            changed = assemble.differences(theirs, mine)
-            if changed:
-                raise ValueError(f"workdir: {self.folder} holds another run: {'; '.join(changed)}")
-        else:
+        if not path.is_file():
+            files.write_json(path, mine)
+            return
+        theirs = assemble.to_dict(assemble.read(path))
+        before = assemble.flatten(theirs)
+        if mine["train"]["steps"] > theirs["train"]["steps"]:
+            theirs["train"]["steps"] = mine["train"]["steps"]
+        theirs["evaluation"] |= {name: mine["evaluation"][name] for name in _ANYWHERE}
+        if changed := assemble.differences(theirs, mine):
+            raise ValueError(f"workdir: {self.folder} holds another run: {'; '.join(changed)}")
+        if extend and assemble.flatten(mine) != before:
             files.write_json(path, mine)

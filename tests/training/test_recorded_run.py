@@ -96,6 +96,23 @@ def read_resampled(data, task):
     return [data.read(task, i, index) for i, index in enumerate(steps)]
 
 
+@pytest.mark.slow
+def test_a_run_can_be_extended_and_not_shortened(finished, folder, tmp_path):
+    """Goes on to 400 updates: the lines before stay as they are, and the folder is that of the longer run."""
+    copy = shutil.copytree(finished[0].folder, tmp_path / "run")
+    before = read_metrics(copy / "metrics.jsonl")
+    config = tiny_config(folder)
+    config.train.steps, config.evaluation.gym_workers = 400, 9
+    make_run(config, copy, QUIET).train()
+    lines = read_metrics(copy / "metrics.jsonl")
+    assert lines[: len(before)] == before
+    assert sorted({line["step"] for line in lines[len(before) :]}) == [350, 400]
+    assert json.loads((copy / "config.json").read_text())["train"]["steps"] == 400
+    with pytest.raises(ValueError, match=r"holds another run: train.steps was 400, now 300"):
+        make_run(tiny_config(folder), copy, QUIET)
+    assert Checkpoints(copy / "checkpoints", read_only=True).latest == 400
+
+
 def test_errors_are_those_of_a_loop_over_demonstrations(finished, folder):
     """Compares what the run reports with what the policy that users load does, step by step."""
     run, result = finished
