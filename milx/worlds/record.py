@@ -9,6 +9,7 @@ Gymnasium and your code alone (--python). A task that cannot be shown often enou
 
 import collections
 import functools
+import itertools
 import pathlib
 import queue
 import sys
@@ -57,16 +58,20 @@ def record(connect: Callable[[], Client], tasks: Sequence[str], demos: int, work
 
     def show(task: str) -> Recorded:
         client, shown, problem = idle.get(), list[Demo](), ""
-        for seed in range(_ATTEMPTS * demos):
-            if len(shown) == demos:
-                break
-            try:
-                client = client or connect()
-                _, arrays = client.ask({"do": "demonstrate", "task": task, "seed": seed})
-                shown.append(_demo(task, arrays))
-            except WorldError as error:
-                client, problem = None, str(error)
-        idle.put(client)
+        try:
+            for seed in range(_ATTEMPTS * demos):
+                if len(shown) == demos:
+                    break
+                try:
+                    client = client or connect()
+                    _, arrays = client.ask({"do": "demonstrate", "task": task, "seed": seed})
+                    shown.append(_demo(task, arrays))
+                except WorldError as error:
+                    if client is not None:
+                        client.close()
+                    client, problem = None, str(error)
+        finally:  # whatever happens, `record` waits for all of them at its end
+            idle.put(client)
         return Recorded(task, shown, problem)
 
     waiting, under_way = collections.deque(tasks), collections.deque[Future[Recorded]]()
@@ -113,14 +118,9 @@ def write(
     shape = None if image is None else episodes.shrunk(image.shape[1:3], height)
     sizes = shape, 0 if state is None else state.shape[1], action.shape[1]
     with Writer(out, *sizes, source) as writer:
-        for task, shown, _ in _chain(first, kept):
+        for task, shown, _ in itertools.chain([first], kept):
             shrunk = [_shrunk(demo, shape) for demo in shown]
             writer.add(task, split_of[task], [len(demo.action) for demo in shown], shrunk, families[task])
-
-
-def _chain(first: Recorded, others: Iterator[Recorded]) -> Iterator[Recorded]:
-    yield first
-    yield from others
 
 
 def _is_complete(recorded: Recorded, demos: int) -> bool:
