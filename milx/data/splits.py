@@ -5,9 +5,7 @@ import hashlib
 import pathlib
 from collections.abc import Iterable, Mapping
 
-from milx.core import files
-from milx.core.files import FileError
-from milx.data.mapping import lookup, read_mapping
+from milx.data.mapping import lookup, read_mapping, read_named
 
 PREFIX = "prefix"
 """The rule by which a task's family is the part of its name before the first "/"."""
@@ -88,10 +86,7 @@ def read_patterns(path: str | pathlib.Path) -> dict[str, list[str]]:
     Raises:
         ValueError: for a file that holds something else.
     """
-    try:
-        patterns = files.read_json(pathlib.Path(path).resolve())
-    except FileError as error:
-        raise ValueError(f"splits: expected a JSON file at {path}: {error}") from error
+    patterns = read_named(path, "splits")
     good = isinstance(patterns, dict) and set(patterns) <= {"validation", "test"}
     if not good or not all(
         isinstance(names, list) and all(isinstance(n, str) for n in names) for names in patterns.values()
