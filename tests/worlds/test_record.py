@@ -76,3 +76,24 @@ def test_nothing_to_record_is_an_error(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(WorldError, match="tasks: missing, expected a function of this name"):
         Client("plain_world:make", sys.executable, 60.0).ask({"do": "tasks"})
+
+
+def test_an_error_of_another_kind_ends_the_recording(monkeypatch):
+    """Fails to start a world in an unexpected way, then gets demonstrations without actions: no world is left."""
+
+    def fail():
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        list(record.record(fail, NAMES, demos=1, workers=2))
+    started = []
+    monkeypatch.setattr(Client, "ask", lambda *_: ({}, {"state": np.zeros((3, 2))}))
+
+    def connect_and_note():
+        started.append(connect()())
+        return started[-1]
+
+    (found,) = record.record(connect_and_note, NAMES[:1], demos=1, workers=1)
+    assert found.demos == []
+    assert "demonstrate returned ['state'], expected an action" in found.problem
+    assert [client._process.poll() for client in started] == [-9, -9]
