@@ -2,16 +2,19 @@
 
     python experiments/robustness/failures.py                   # each operation once, the kinds of failure in turn
     python experiments/robustness/failures.py --every=1 --kinds=SIGKILL
+    python experiments/robustness/failures.py --calls --every=7    # every seventh call to the C library
 
 A life imports demonstrations, trains, validates and writes checkpoints, evaluates, exports and loads. In a process of
 its own it is disturbed once, at the n-th operation on a file that Python makes in its folder: opening, synchronizing,
-locking, renaming, removing, or making a folder. It has to end within the deadline, with the right exit code and a
-message; what it has left must be whole; and the same life, begun again, must end with the parameters of the one that
-was not disturbed.
+locking, renaming, removing, or making a folder. With `--calls` it is the n-th call to the C library that touches a
+file there, reading and writing included, also of TensorStore, HDF5 and Arrow (Linux, with a C compiler). It has to end
+within the deadline, with the right exit code and a message; what it has left must be whole; and the same life, begun
+again, must end with the parameters of the one that was not disturbed.
 """
 
 import concurrent.futures
 import contextlib
+import ctypes
 import errno
 import fcntl
 import itertools
@@ -19,6 +22,7 @@ import json
 import os
 import pathlib
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -32,6 +36,8 @@ import numpy as np
 from absl import app, flags, logging
 
 KINDS = ("ENOSPC", "SIGKILL", "EIO", "SIGTERM", "full", "SIGINT", "SIGHUP")
+CALL_KINDS = ("EIO", "SIGKILL", "short", "ENOSPC", "SIGTERM")
+"""What can happen to a call to the C library; "short" reads or writes half of the bytes."""
 FLAGS = flags.FLAGS
 DEADLINE = 120
 """Seconds in which a life must have ended, disturbed or not."""
@@ -122,7 +128,8 @@ def live(folder: pathlib.Path, at: int, kind: str) -> None:
             export(milx.load(folder / "run"), folder / "exported")
         standalone.Policy(folder / "exported")
         params = milx.load(folder / "run").params
-    print(json.dumps({"params": pytrees.fingerprint(params), "operations": count[0]}))
+    operations = ctypes.CDLL(None).fail_calls_count() if "FAIL_IN" in os.environ else count[0]
+    print(json.dumps({"params": pytrees.fingerprint(params), "operations": operations}))
 
 
 class Outcome(NamedTuple):
@@ -141,11 +148,25 @@ def _heed_signals() -> None:
         signal.signal(number, signal.SIG_DFL)
 
 
-def begin(folder: pathlib.Path, at: int = 0, kind: str = "") -> Outcome:
-    """Lives in a process of its own."""
-    command = [sys.executable, __file__, f"--life={folder}", f"--at={at}", f"--kind={kind}"]
-    began = time.perf_counter()
+def compile_calls(folder: pathlib.Path) -> pathlib.Path:
+    """Compiles the library that lets calls to the C library fail."""
+    library = folder / "fail_calls.so"
+    source = pathlib.Path(__file__).with_name("fail_calls.c")
+    subprocess.run(["cc", "-shared", "-fPIC", "-O1", "-o", library, source, "-ldl"], check=True)
+    return library
+
+
+def begin(folder: pathlib.Path, at: int = 0, kind: str = "", library: pathlib.Path | None = None) -> Outcome:
+    """Lives in a process of its own, in which an operation of Python fails or, with the library, a call."""
+    command = [sys.executable, __file__, f"--life={folder}"]
     environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(folder.parent / "programs")}
+    if library:
+        number = str(int(getattr(signal, kind))) if kind.startswith("SIG") else kind
+        environment |= {"LD_PRELOAD": str(library), "FAIL_IN": f"{folder.resolve()}{os.sep}"}
+        environment |= {"FAIL_AT": str(at), "FAIL_KIND": number}
+    else:
+        command += [f"--at={at}", f"--kind={kind}"]
+    began = time.perf_counter()
     try:
         done = subprocess.run(
             command, capture_output=True, text=True, timeout=DEADLINE, env=environment, preexec_fn=_heed_signals
@@ -175,12 +196,15 @@ def wrong(disturbed: Outcome, again: Outcome, kind: str, params: str) -> list[st
     return found
 
 
-def fail_once(folder: pathlib.Path, at: int, kind: str, params: str) -> dict[str, Any]:
+def fail_once(
+    folder: pathlib.Path, at: int, kind: str, params: str, library: pathlib.Path | None = None
+) -> dict[str, Any]:
     """Disturbs a life, begins it again, and reports both."""
     mine = folder / f"{at:04d}-{kind}"
     mine.mkdir()
-    disturbed = begin(mine, at, kind)
+    disturbed = begin(mine, at, kind, library)
     again = begin(mine)
+    shutil.rmtree(mine)
     return {
         "operation": at,
         "kind": kind,
@@ -199,20 +223,23 @@ def main(_: list[str]) -> None:
     from milx.core import files
     from milx.evaluation import provenance
 
-    out = pathlib.Path(FLAGS.out or pathlib.Path(__file__).parents[1] / "results" / "robustness" / "failures-cpu.json")
+    results = pathlib.Path(__file__).parents[1] / "results" / "robustness"
+    out = pathlib.Path(FLAGS.out or results / ("failures-calls-cpu.json" if FLAGS.calls else "failures-cpu.json"))
     with tempfile.TemporaryDirectory() as name:
         folder = pathlib.Path(name)
         write_recording(folder)
+        library = compile_calls(folder) if FLAGS.calls else None
+        kinds = FLAGS.kinds or (CALL_KINDS if FLAGS.calls else KINDS)
         for number in range(2):  # the first one compiles
             (folder / f"good{number}").mkdir()
-            good = begin(folder / f"good{number}")
+            good = begin(folder / f"good{number}", library=library)
             print(f"undisturbed: exit code {good.code}, {good.seconds:.1f} s, {good.result}", flush=True)
         params, operations = good.result["params"], good.result["operations"]
-        numbers = range(1, operations + 1, FLAGS.every)
+        numbers = range(FLAGS.first, operations + 1, FLAGS.every)
         with concurrent.futures.ThreadPoolExecutor(FLAGS.processes) as pool:
-            pairs = zip(numbers, itertools.cycle(FLAGS.kinds), strict=False)
+            pairs = zip(numbers, itertools.cycle(kinds), strict=False)
             lives = []
-            for life in pool.map(lambda pair: fail_once(folder, *pair, params), pairs):
+            for life in pool.map(lambda pair: fail_once(folder, *pair, params, library), pairs):
                 lives.append(life)
                 if life["wrong"]:
                     print(
@@ -227,7 +254,9 @@ def main(_: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    flags.DEFINE_list("kinds", list(KINDS), "What happens; with several, each operation gets the next one.")
+    flags.DEFINE_bool("calls", False, "Calls to the C library instead of operations of Python.")
+    flags.DEFINE_list("kinds", None, "What happens; with several, each operation gets the next one. Default all.")
+    flags.DEFINE_integer("first", 1, "The first operation.", lower_bound=1)
     flags.DEFINE_integer("every", 1, "Only every so many operations.", lower_bound=1)
     flags.DEFINE_integer("processes", 2, "Lives at once.", lower_bound=1)
     flags.DEFINE_string("out", None, "The JSON file; default experiments/results/robustness/failures-cpu.json.")
