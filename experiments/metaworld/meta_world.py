@@ -23,9 +23,11 @@ from metaworld.policies import ENV_POLICY_MAP
 FAMILIES = ("button-press-topdown-v3", "door-open-v3", "drawer-open-v3", "pick-place-v3", "push-v3", "reach-v3")
 TASKS = 120
 """Tasks of every family; 50 come from every seed of Meta-World's."""
-STEPS = 150
+STEPS = 200
 """Time steps of an episode."""
-CAMERA, PIXELS, ZOOM = "corner2", 64, 1.6
+PIXELS = 64
+EYE, TARGET, FIELD = (0.85, 0.3, 0.62), (0.02, 0.72, 0.16), 42.0
+"""Where the camera is (m), what it looks at, and its field of view (degrees): the table, seen over a corner of it."""
 _AFTER, _WANDER = 5, 8
 
 
@@ -111,13 +113,11 @@ class MetaWorld(gymnasium.Env):
 
     def _draw(self) -> np.ndarray:
         """Casts a ray through every pixel; geoms have their colors, darker where they are farther away."""
-        model, data = self._env.model, self._env.data
-        camera, where = _rays(float(model.camera(CAMERA).fovy[0])), model.camera(CAMERA).id
-        rays = camera @ data.cam_xmat[where].reshape(3, 3).T
+        rays = _rays()
         geom, distance = np.zeros(len(rays), np.int32), np.zeros(len(rays))
-        origin = data.cam_xpos[where]
-        mujoco.mj_multiRay(model, data, origin, rays.ravel(), None, 1, -1, geom, distance, len(rays), 10.0)
-        shade = np.clip(2.2 - 0.6 * distance, 0.4, 1.6)[:, None]
+        model, data = self._env.model, self._env.data
+        mujoco.mj_multiRay(model, data, np.array(EYE), rays.ravel(), None, 1, -1, geom, distance, len(rays), 10.0)
+        shade = np.clip(1.8 - 0.7 * distance, 0.4, 1.6)[:, None]
         image = np.where((geom >= 0)[:, None], self._colors[geom] * shade, 0.0)
         return (255 * np.clip(image, 0, 1)).astype(np.uint8).reshape(PIXELS, PIXELS, 3)
 
@@ -138,9 +138,12 @@ def _colors(model: mujoco.MjModel) -> np.ndarray:
 
 
 @functools.cache
-def _rays(fovy: float) -> np.ndarray:
-    """Returns the directions [P, 3] through the pixels in the camera's frame, which looks along -z upside down."""
-    focal = ZOOM * 0.5 * PIXELS / np.tan(np.deg2rad(fovy) / 2)
-    y, x = np.mgrid[:PIXELS, :PIXELS] + 0.5 - PIXELS / 2
-    rays = np.stack([x / focal, y / focal, -np.ones_like(x)], axis=-1).reshape(-1, 3)
-    return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+def _rays() -> np.ndarray:
+    """Returns the directions [P, 3] through the pixels."""
+    ahead = np.subtract(TARGET, EYE) / np.linalg.norm(np.subtract(TARGET, EYE))
+    right = np.cross(ahead, (0.0, 0.0, 1.0))
+    right /= np.linalg.norm(right)
+    y, x = (np.mgrid[:PIXELS, :PIXELS] + 0.5) * 2 / PIXELS - 1
+    size = np.tan(np.deg2rad(FIELD) / 2)
+    rays = ahead + size * (x[..., None] * right - y[..., None] * np.cross(right, ahead))
+    return (rays / np.linalg.norm(rays, axis=-1, keepdims=True)).reshape(-1, 3)
