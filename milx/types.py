@@ -6,9 +6,11 @@ Letters used in shapes throughout the project:
 """
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any
 
 import jax
+import numpy as np
 
 Array = Any
 """A `jax.Array`. Public functions also accept NumPy arrays. Inside `jax.eval_shape` it is a `jax.ShapeDtypeStruct`."""
@@ -23,6 +25,9 @@ Memory = Any
 """A pytree of arrays that a policy passes from one time step to the next; `()` for a policy without memory."""
 
 
+ImageShape = tuple[int, int] | dict[str, tuple[int, int]] | None
+"""(H, W) of images; with several cameras a dictionary of them by name, None where a policy sees no pixels."""
+
 SPLITS = ("train", "validation", "test")
 """Tasks for meta-training, tasks for selecting the best checkpoint, and tasks for the reported result."""
 
@@ -36,7 +41,8 @@ class Observation:
     """What a policy observes at one time step. All fields may have the same leading axes in front.
 
     Attributes:
-        image: [H, W, 3] uint8, RGB; None if the policy sees no pixels.
+        image: [H, W, 3] uint8, RGB; with several cameras a dictionary of images by name; None if the policy sees no
+            pixels.
         state: [S] float32, the robot's state in its natural units; without an image it includes the objects' state.
     """
 
@@ -50,7 +56,8 @@ class Demo:
     """One demonstration, or several with leading axes such as `[N, K]`.
 
     Attributes:
-        image: [T, H, W, 3] uint8, RGB; None if the policy sees no pixels.
+        image: [T, H, W, 3] uint8, RGB; with several cameras a dictionary of such arrays by name; None if the policy
+            sees no pixels.
         state: [T, S] float32; None when the demonstration has no states.
         action: [T, A] float32; None when the demonstration has no actions.
         goal: [T, G] float32, where the robot was heading (`milx.data.goals`), in the units of the state; NaN at time
@@ -84,7 +91,8 @@ class Spec:
     """The sizes of a policy's observations and actions, and the meaning of some entries of the state.
 
     Attributes:
-        image_shape: (H, W); None if the policy sees no pixels.
+        image_shape: (H, W); with several cameras a dictionary of them by name, of which the first is what a goal head
+            looks at; None if the policy sees no pixels.
         state_size: S.
         action_size: A.
         action_range: minimum and maximum of each entry of the action; None if actions have no limits.
@@ -97,7 +105,7 @@ class Spec:
             must come down to an object; None otherwise.
     """
 
-    image_shape: tuple[int, int] | None
+    image_shape: ImageShape
     state_size: int
     action_size: int
     action_range: tuple[tuple[float, ...], tuple[float, ...]] | None
@@ -133,7 +141,7 @@ class Spec:
         size, actions = (value if type(value) is int else 0 for value in (spec.state_size, spec.action_size))
         goal, objects = (len(x) if isinstance(x, tuple) else 0 for x in (spec.goal_indices, spec.object_indices))
         good = {
-            "image_shape": spec.image_shape is None or _is_table(spec.image_shape, (2,), 1, _LARGEST),
+            "image_shape": spec.image_shape != {} and all(map(is_image_shape, by_field(spec.image_shape).values())),
             "state_size": _is_table((spec.state_size,), (1,), 0, _LARGEST),
             "action_size": _is_table((spec.action_size,), (1,), 1, _LARGEST),
             "action_range": spec.action_range is None or _is_table(spec.action_range, (2, actions)),
@@ -151,7 +159,42 @@ _LARGEST = 1 << 20
 """More than any size of a policy."""
 
 
+def by_field(image: Any) -> dict[str, Any]:
+    """Names the images, or the shapes, of all cameras: "image" if there is one, "image.wrist" if it has the name wrist.
+
+    These are the names of arrays in files, in messages between processes, and in errors. None has no name.
+    """
+    if image is None:
+        return {}
+    return {f"image.{camera}": each for camera, each in image.items()} if isinstance(image, dict) else {"image": image}
+
+
+def from_fields(fields: Mapping[str, Any]) -> Any:
+    """Inverts `by_field`; other fields may be among them."""
+    if "image" in fields:
+        return fields["image"]
+    named = {name.removeprefix("image."): value for name, value in fields.items() if name.startswith("image.")}
+    return named or None
+
+
+def is_image(field: str) -> bool:
+    """Tells whether an array of this name holds images."""
+    return field.partition(".")[0] == "image"
+
+
+def black(shape: ImageShape, lead: tuple[int, ...] = ()) -> Any:
+    """Makes black images [*lead, H, W, 3] of these sizes; None without any."""
+    return from_fields({name: np.zeros((*lead, *size, 3), np.uint8) for name, size in by_field(shape).items()})
+
+
+def is_image_shape(value: Any) -> bool:
+    """Tells whether a value is (H, W) of one camera."""
+    return _is_table(value, (2,), 1, _LARGEST)
+
+
 def _as_tuple(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _as_tuple(each) for name, each in value.items()}
     return tuple(_as_tuple(each) for each in value) if isinstance(value, list) else value
 
 

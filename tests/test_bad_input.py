@@ -303,7 +303,7 @@ def test_files_of_robomimic(data, tmp_path_factory):
 
     def read():
         source = Robomimic(path, None, "robot0_eef_pos", "actions", 128)
-        return source.sizes, [episode.read() for episode in source.episodes("file")]
+        return source.contents, [episode.read() for episode in source.episodes("file")]
 
     found = accepted(read)
     if found is not None:

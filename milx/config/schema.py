@@ -129,10 +129,13 @@ class VisionConfig(NetworkConfig, ConvConfig):  # in this order of the bases, fi
         goal_head: predict the goal from the image, or from the state if the policy sees no pixels, and pass the
             prediction on to the following layers (`milx.networks.goal`).
         calibrate: initialize the goal head's votes from the camera's calibration, if it is known.
+        share_encoder: with several cameras, apply the same convolutions to the images of all; otherwise each camera has
+            its own.
     """
 
     goal_head: bool = False
     calibrate: bool = True
+    share_encoder: bool = False
 
 
 @dataclasses.dataclass

@@ -11,7 +11,7 @@ from milx.core.commands import command
 from milx.core.messages import printable
 from milx.data.dataset import DataSet, check_size
 from milx.methods.whitening import MIN_STD
-from milx.types import SPLITS
+from milx.types import SPLITS, by_field
 
 MANY_ROWS = 256
 """Images with more rows than this are slow to learn from."""
@@ -39,8 +39,9 @@ def problems(data: DataSet) -> list[str]:
         found.append(f"lengths from {min(lengths)} to {max(lengths)} steps: all are resampled to recorded.horizon")
     if head.image_shape is None:
         found.append("no images: policies see states only")
-    elif head.image_shape[0] > MANY_ROWS:
-        found.append(f"images of {head.image_shape}: import them with fewer rows (--height)")
+    for name, size in by_field(head.image_shape).items():
+        if size[0] > MANY_ROWS:
+            found.append(f"{name} of {size[0]} x {size[1]}: import it with fewer rows (--height)")
     for field, values in vectors(data).items():
         bad = ~np.isfinite(values)
         if bad.any():
@@ -49,9 +50,10 @@ def problems(data: DataSet) -> list[str]:
             found.append(f"{field}[{i}] is constant: it says nothing")
     for number, task in enumerate(head.tasks):
         if head.image_shape is not None and task.lengths:
-            image = data.read(number, 0, np.zeros(1, int), fields=("image",)).image
-            if image.min() == image.max():
-                found.append(f"task {task.name!r}: the first image is of one color")
+            seen = data.read(number, 0, np.zeros(1, int), fields=("image",)).image
+            for name, image in by_field(seen).items():
+                if image.min() == image.max():
+                    found.append(f"task {task.name!r}: the first {name} is of one color")
     return found
 
 
@@ -81,7 +83,8 @@ def describe(data: DataSet, console: Console) -> None:
         f"{printable(str(data.folder))}: {len(head.tasks)} tasks, {len(lengths)} demonstrations, "
         f"from {printable(head.source) or 'unknown'}"
     )
-    image = "no images" if head.image_shape is None else f"images {head.image_shape[0]} x {head.image_shape[1]}"
+    sizes = [f"{name} {size[0]} x {size[1]}" for name, size in by_field(head.image_shape).items()]
+    image = ", ".join(sizes) or "no images"
     if lengths:
         median = int(np.median(lengths))
         console.print(f"{image}; {min(lengths)} to {max(lengths)} steps, half of them at most {median}")

@@ -2,7 +2,7 @@
 
     zarr.json               a zarr (version 3) group; its attributes hold the header
     00000/                  the first task: a group with all its demonstrations, one after the other
-        image               [F, H, W, 3] uint8, where there are images
+        image               [F, H, W, 3] uint8, where there are images; image.NAME for each of several cameras
         state               [F, S] float32
         action              [F, A] float32, NaN where a demonstration shows none
 
@@ -17,7 +17,7 @@ import hashlib
 import json
 import math
 import pathlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -25,8 +25,8 @@ import tensorstore as ts
 
 from milx.core import files
 from milx.core.files import MAX_BYTES, FileError
-from milx.data.header import VERSION, Header, TaskInfo, read_header
-from milx.types import SPLITS, Demo
+from milx.data.header import VERSION, Header, TaskInfo, parse_header, read_header
+from milx.types import SPLITS, Demo, ImageShape, by_field, from_fields, is_image
 
 ALL_FIELDS = ("image", "state", "action")
 _CHUNK_BYTES = 1 << 20
@@ -42,29 +42,39 @@ class Writer:
 
     Args:
         folder: the data set's; must not exist.
-        image_shape: (H, W); None without images.
+        image_shape: (H, W); with several cameras a dictionary of them by name; None without images.
         state_size: S.
         action_size: A.
         source: where the demonstrations come from.
+        fps: time steps in a second; None if it is not known.
+        state_names: of the entries of the state; none if they have none.
+        action_names: of the entries of the action, likewise.
 
     Raises:
-        ValueError: if the folder exists, as nothing is written over, or there are no actions.
+        ValueError: if the folder exists, as nothing is written over, there are no actions, or for sizes and names that
+            do not fit.
     """
 
     def __init__(
         self,
         folder: str | pathlib.Path,
-        image_shape: tuple[int, int] | None,
+        image_shape: ImageShape,
         state_size: int,
         action_size: int,
         source: str = "",
+        fps: float | None = None,
+        state_names: Sequence[str] = (),
+        action_names: Sequence[str] = (),
     ):
         self.folder = pathlib.Path(folder)
         if self.folder.exists():
             raise ValueError(f"out: {self.folder} exists, expected a folder that does not: nothing is written over")
         if action_size < 1:
             raise ValueError(f"action_size: got {action_size}, expected at least 1: there is nothing to imitate")
-        self._header = Header(image_shape, state_size, action_size, (), source)
+        self._header = parse_header(
+            {"image_shape": image_shape, "state_size": state_size, "action_size": action_size, "tasks": ()}
+            | {"source": source, "fps": fps, "state_names": state_names, "action_names": action_names}
+        )
         self._tasks: list[TaskInfo] = []
         self._stack = contextlib.ExitStack()
 
@@ -83,7 +93,15 @@ class Writer:
             header = dataclasses.replace(self._header, tasks=tuple(self._tasks))
             _write_group(self._partial, {"milx": {"version": VERSION, **dataclasses.asdict(header)}})
 
-    def add(self, name: str, split: str, lengths: list[int], demos: Iterable[Demo], family: str = "") -> None:
+    def add(
+        self,
+        name: str,
+        split: str,
+        lengths: list[int],
+        demos: Iterable[Demo],
+        family: str = "",
+        instructions: Sequence[str] = (),
+    ) -> None:
         """Writes a task.
 
         Args:
@@ -92,6 +110,7 @@ class Writer:
             lengths: time steps of its demonstrations.
             demos: as many; with arrays [T, ...], and no action where the demonstration shows none.
             family: the kind of task; "" for none.
+            instructions: what was said to be done in each demonstration; none if nothing was.
 
         Raises:
             ValueError: for a split that does not exist, or a demonstration without time steps or of another shape than
@@ -106,26 +125,27 @@ class Writer:
         arrays = {
             field: _create(folder / field, (total, *shape), dtype) for field, (shape, dtype) in _fields(head).items()
         }
-        start, has_action = 0, []
+        start, has_action, said = 0, [], tuple(instructions) if any(instructions) else ()
         for i, (length, demo) in enumerate(zip(lengths, demos, strict=True)):
             has_action.append(demo.action is not None)
             if demo.action is None:
                 demo = dataclasses.replace(demo, action=np.full((length, head.action_size), np.nan))
+            values = {**by_field(demo.image), "state": demo.state, "action": demo.action}
             for field, array in arrays.items():
-                value = np.asarray(getattr(demo, field))
+                value = np.asarray(values.get(field))
                 expected = (length, *array.shape[1:])
                 where = f"demonstration {i} of {name!r}: {field}"
                 if value.shape != expected:
                     raise ValueError(f"{where}: got shape {list(value.shape)}, expected {list(expected)}")
-                if value.dtype != np.uint8 if field == "image" else value.dtype.kind not in "fiu":
-                    wanted = "uint8 in [0, 255]" if field == "image" else "real numbers"
+                if value.dtype != np.uint8 if is_image(field) else value.dtype.kind not in "fiu":
+                    wanted = "uint8 in [0, 255]" if is_image(field) else "real numbers"
                     raise ValueError(f"{where}: got {value.dtype}, expected {wanted}")
                 try:
                     array[start : start + length].write(value.astype(array.dtype.numpy_dtype)).result()
                 except ValueError as error:  # as TensorStore reports a full disk, too
                     raise FileError(f"{self.folder}: cannot be written: {str(error)[:300]}") from error
             start += length
-        self._tasks.append(TaskInfo(name, split, tuple(lengths), tuple(has_action), family))
+        self._tasks.append(TaskInfo(name, split, tuple(lengths), tuple(has_action), family, said))
 
 
 class DataSet:
@@ -149,11 +169,13 @@ class DataSet:
     def fingerprint(self) -> str:
         """Computes the SHA-256 of the header and of all states and actions.
 
-        Images count by their sizes alone, and families not at all, as nothing is learned from them.
+        Images count by their sizes alone, and what nothing is learned from not at all: families, instructions, names.
         """
         header = dataclasses.asdict(self.header)
+        for name in ("fps", "state_names", "action_names"):
+            del header[name]
         for task in header["tasks"]:
-            del task["family"]
+            del task["family"], task["instructions"]
         digest = hashlib.sha256(json.dumps(header).encode())
         for i in range(len(self.header.tasks)):
             for field in ("state", "action"):
@@ -175,7 +197,8 @@ class DataSet:
         """Starts reading a demonstration; the result is a function that waits for it and returns it."""
         info = self.header.tasks[task]
         there = set(_fields(self.header)) - ({"action"} if not info.has_action[demo] else set())
-        arrays = {field: self._array(task, field) for field in fields if field in there}
+        wanted = {name for name in there if name.partition(".")[0] in fields}
+        arrays = {name: self._array(task, name) for name in sorted(wanted)}
         count = info.lengths[demo] if frames is None else len(frames)
         for field, array in arrays.items():
             check_size(
@@ -185,7 +208,8 @@ class DataSet:
         begun = {field: array[rows].read() for field, array in arrays.items()}
 
         def finish() -> Demo:
-            return Demo(**{field: self._wait(future) for field, future in begun.items()})
+            read = {field: self._wait(future) for field, future in begun.items()}
+            return Demo(from_fields(read), read.get("state"), read.get("action"))
 
         return finish
 
@@ -238,9 +262,7 @@ def _fields(header: Header) -> dict[str, tuple[tuple[int, ...], Any]]:
     fields: dict[str, tuple[tuple[int, ...], Any]] = {"action": ((header.action_size,), np.float32)}
     if header.state_size:
         fields["state"] = ((header.state_size,), np.float32)
-    if header.image_shape is not None:
-        fields["image"] = ((*header.image_shape, 3), np.uint8)
-    return fields
+    return fields | {name: ((*size, 3), np.uint8) for name, size in by_field(header.image_shape).items()}
 
 
 def _kvstore(path: pathlib.Path) -> dict[str, str]:

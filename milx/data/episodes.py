@@ -1,19 +1,18 @@
 """What importers share: which episodes make a task, which tasks make a split, and writing them down."""
 
 import pathlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from absl import app, flags
-from PIL import Image
 from rich.progress import track
 
 from milx.core.commands import command
-from milx.data import splits
+from milx.data import cameras, splits
 from milx.data.dataset import Writer
 from milx.data.splits import PREFIX
-from milx.types import Demo
+from milx.types import Demo, ImageShape
 
 FLAGS = flags.FLAGS
 
@@ -25,27 +24,32 @@ class Episode(NamedTuple):
         task: the name of its task.
         length: its time steps.
         has_action: whether it shows actions.
-        read: reads its arrays.
+        read: reads its arrays; images may be larger than the data set's.
+        instruction: what the source says was to be done; "" for nothing.
     """
 
     task: str
     length: int
     has_action: bool
     read: Callable[[], Demo]
+    instruction: str = ""
 
 
-class Sizes(NamedTuple):
-    """(H, W) of the images or None, S and A, as in a data set's header."""
+class Contents(NamedTuple):
+    """What all episodes of a source show, as in a data set's header."""
 
-    image_shape: tuple[int, int] | None
-    state: int
-    action: int
+    image_shape: ImageShape
+    state_size: int
+    action_size: int
+    fps: float | None = None
+    state_names: tuple[str, ...] = ()
+    action_names: tuple[str, ...] = ()
 
 
 class Source(Protocol):
     """What an importer makes of the files of others."""
 
-    sizes: Sizes
+    contents: Contents
 
     def episodes(self, task: str) -> list[Episode]:
         """Lists all episodes; `task` says what makes a task."""
@@ -53,8 +57,10 @@ class Source(Protocol):
 
 def define_flags(*, state: str, action: str, task: str) -> None:
     """Defines the flags of an importer's command line, with these defaults."""
-    flags.DEFINE_string("camera", None, "Where the images are; the only camera if not given, none if empty.")
-    flags.DEFINE_string("state", state, "Where the robot's state is; empty for none.")
+    camera = "Where the images are; several cameras separated by commas, the only one if not given, none if empty."
+    flags.DEFINE_string("camera", None, camera)
+    parts = "Where the robot's state is; several parts separated by commas, empty for none."
+    flags.DEFINE_string("state", state, parts)
     flags.DEFINE_string("action", action, "Where the actions are; empty for none.")
     flags.DEFINE_string("task", task, "What makes a task: see above.")
     define_split_flags()
@@ -90,14 +96,14 @@ def run(argv: list[str], open_source: Callable[[str, Any], Source]) -> None:
         episodes = source.episodes(FLAGS.task)
         families = splits.families_of({episode.task for episode in episodes}, FLAGS.family)
         chosen = None if FLAGS.splits is None else splits.read_patterns(FLAGS.splits)
-        write(argv[2], episodes, source.sizes, (FLAGS.validation, FLAGS.test), argv[1], families, chosen)
+        write(argv[2], episodes, source.contents, (FLAGS.validation, FLAGS.test), argv[1], families, chosen)
         print(f"{argv[2]}: look at it with `python -m milx.data.check {argv[2]}`")
 
 
 def write(
     out: str | pathlib.Path,
     episodes: Iterable[Episode],
-    sizes: Sizes,
+    contents: Contents,
     held_out: tuple[float, float],
     source: str,
     families: Mapping[str, str] | None = None,
@@ -108,7 +114,7 @@ def write(
     Args:
         out: the folder; must not exist.
         episodes: all of them, in any order.
-        sizes: of what they show.
+        contents: what they show.
         held_out: the fractions of the tasks that become validation and test tasks.
         source: where they come from.
         families: of the tasks, by name; none if not given.
@@ -116,36 +122,23 @@ def write(
 
     Raises:
         ValueError: for fractions or patterns as `milx.data.splits` refuses them, or an episode that does not fit the
-            sizes.
+            contents.
     """
     tasks: dict[str, list[Episode]] = {}
     for episode in episodes:
         tasks.setdefault(episode.task, []).append(episode)
     families = families or dict.fromkeys(tasks, "")
     split_of = splits.choose(sorted(tasks), chosen) if chosen is not None else splits.by_family(families, *held_out)
-    with Writer(out, *sizes, source) as writer:
+    with Writer(out, source=source, **contents._asdict()) as writer:
         for name in track(sorted(tasks), "writing tasks"):
             own = tasks[name]
-            demos = (_as_written(episode, sizes) for episode in own)
-            writer.add(name, split_of[name], [episode.length for episode in own], demos, families[name])
+            demos = (_as_written(episode, contents) for episode in own)
+            lengths, said = [episode.length for episode in own], [episode.instruction for episode in own]
+            writer.add(name, split_of[name], lengths, demos, families[name], said)
 
 
-def shrunk(shape: tuple[int, ...], height: int) -> tuple[int, int]:
-    """Computes (H, W) of an image of this shape shrunk to at most `height` rows, in the same proportions."""
-    scale = min(1.0, height / shape[0])
-    return max(1, round(scale * shape[0])), max(1, round(scale * shape[1]))
-
-
-def resized(images: Iterator[np.ndarray], shape: tuple[int, int]) -> Iterator[np.ndarray]:
-    """Resizes images [H, W, 3] uint8 to `shape`; each yields means over areas where it shrinks."""
-    for image in images:
-        if image.shape[:2] != shape:
-            image = np.asarray(Image.fromarray(image).resize(shape[::-1], Image.Resampling.BOX))
-        yield image
-
-
-def _as_written(episode: Episode, sizes: Sizes) -> Demo:
+def _as_written(episode: Episode, contents: Contents) -> Demo:
     demo = episode.read()
     action = None if demo.action is None else np.asarray(demo.action, np.float32)
-    state = np.asarray(demo.state, np.float32) if sizes.state else None
-    return Demo(demo.image if sizes.image_shape else None, state, action)
+    state = np.asarray(demo.state, np.float32) if contents.state_size else None
+    return Demo(cameras.fitted(demo.image, contents.image_shape), state, action)

@@ -2,14 +2,15 @@
 
 import dataclasses
 import pathlib
+import re
 from typing import Any
 
 from milx.core import files
 from milx.core.files import FileError
-from milx.types import SPLITS
+from milx.types import SPLITS, ImageShape, by_field, is_image_shape
 
-VERSION = 1
-"""The number of the layout of data sets."""
+VERSION = 2
+"""The number of the layout of data sets. Those of version 1 have one camera."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,6 +23,7 @@ class TaskInfo:
         lengths: time steps of each of its demonstrations.
         has_action: whether each of them shows actions.
         family: the kind of task; tasks of one family differ in their goals or objects. "" for none.
+        instructions: what was said to be done in each of its demonstrations; empty if nothing was.
     """
 
     name: str
@@ -29,6 +31,7 @@ class TaskInfo:
     lengths: tuple[int, ...]
     has_action: tuple[bool, ...]
     family: str = ""
+    instructions: tuple[str, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,18 +39,24 @@ class Header:
     """What a data set holds.
 
     Attributes:
-        image_shape: (H, W); None without images.
+        image_shape: (H, W); with several cameras a dictionary of them by name; None without images.
         state_size: S, 0 without states.
         action_size: A.
         tasks: all tasks, in the order of their folders.
         source: where they come from, for people.
+        fps: time steps in a second; None if it is not known.
+        state_names: of the entries of the state; empty if they have none.
+        action_names: of the entries of the action, likewise.
     """
 
-    image_shape: tuple[int, int] | None
+    image_shape: ImageShape
     state_size: int
     action_size: int
     tasks: tuple[TaskInfo, ...]
     source: str = ""
+    fps: float | None = None
+    state_names: tuple[str, ...] = ()
+    action_names: tuple[str, ...] = ()
 
     def of_split(self, split: str) -> list[int]:
         """Lists the numbers of the split's tasks."""
@@ -68,24 +77,30 @@ def read_header(folder: pathlib.Path) -> Header:
     try:
         values = dict(whole["attributes"]["milx"])
         version = values.pop("version")
-        if version != VERSION:
-            raise ValueError(f"version: got {version!r}, expected {VERSION}")
-        return _parse_header(values)
+        if version not in range(1, VERSION + 1):
+            raise ValueError(f"version: got {version!r}, expected 1 to {VERSION}")
+        return parse_header(values)
     except (KeyError, TypeError, AttributeError, ValueError, RecursionError) as error:
         raise FileError(f"{path}: expected the header of a milx data set: {error}") from error
 
 
-def _parse_header(values: dict[str, Any]) -> Header:
-    shape = values["image_shape"]
-    sizes = [values["state_size"], values["action_size"], *(shape or ())]
-    whole = all(isinstance(size, int) and 0 <= size < 1 << 20 for size in sizes) and sizes[1] > 0
-    if not whole or (shape is not None and (len(shape) != 2 or 0 in shape)):
-        got = f"image_shape {shape}, state_size {sizes[0]} and action_size {sizes[1]}"
-        raise ValueError(f"sizes: got {got}, expected whole numbers, two of them for images; actions, too")
+def parse_header(values: dict[str, Any]) -> Header:
+    """Builds a header from a dictionary with its fields.
+
+    Raises:
+        KeyError: for a field that is missing.
+        ValueError: for a value that is not possible; others may be a TypeError or an AttributeError.
+    """
+    shape = check_cameras(values["image_shape"])
+    sizes = values["state_size"], values["action_size"]
+    if not all(isinstance(size, int) and 0 <= size < 1 << 20 for size in sizes) or not sizes[1]:
+        got = f"state_size {sizes[0]!r:.20} and action_size {sizes[1]!r:.20}"
+        raise ValueError(f"sizes: got {got}, expected whole numbers; at least one action")
     tasks = []
     for i, task in enumerate(values["tasks"]):
         lengths, has_action = tuple(task["lengths"]), tuple(task["has_action"])
-        info = TaskInfo(task["name"], task["split"], lengths, has_action, task.get("family", ""))
+        said = _texts(f"tasks[{i}].instructions", task.get("instructions", ()), len(lengths))
+        info = TaskInfo(task["name"], task["split"], lengths, has_action, task.get("family", ""), said)
         for field in ("name", "family"):
             if not isinstance(getattr(info, field), str):
                 raise ValueError(f"tasks[{i}].{field}: got {getattr(info, field)!r:.100}, expected text")
@@ -96,10 +111,38 @@ def _parse_header(values: dict[str, Any]) -> Header:
         if len(info.has_action) != len(info.lengths):
             raise ValueError(f"tasks[{i}].has_action: got {len(info.has_action)}, expected {len(info.lengths)}")
         tasks.append(info)
-    return Header(
-        None if shape is None else tuple(shape),
-        values["state_size"],
-        values["action_size"],
-        tuple(tasks),
-        str(values["source"]),
-    )
+    fps = values.get("fps")
+    if fps is not None and (type(fps) not in (int, float) or not 0 < fps < 1e6):
+        raise ValueError(f"fps: got {fps!r:.100}, expected a positive number")
+    names = (_texts(f"{field}_names", values.get(f"{field}_names", ()), values[f"{field}_size"]) for field in _VECTORS)
+    return Header(shape, *sizes, tuple(tasks), str(values["source"]), fps, *names)
+
+
+_VECTORS = "state", "action"
+
+
+def _texts(field: str, value: Any, count: int) -> tuple[str, ...]:
+    """Checks texts, one for each of `count` things or none at all."""
+    if not isinstance(value, list | tuple) or len(value) not in (0, count):
+        raise ValueError(f"{field}: got {value!r:.100}, expected {count} texts, or none")
+    if not all(isinstance(text, str) for text in value):
+        raise ValueError(f"{field}: got {value!r:.100}, expected texts")
+    return tuple(value)
+
+
+def check_cameras(shape: Any) -> ImageShape:
+    """Checks the sizes of images, and returns them as tuples.
+
+    Raises:
+        ValueError: for sizes that are not two whole numbers, or a camera whose name cannot be that of a file.
+    """
+    if isinstance(shape, dict):
+        if bad := [name for name in shape if not re.fullmatch(r"[A-Za-z0-9_-]{1,64}", name)] or not shape:
+            raise ValueError(f"cameras: got the names {bad!r:.200}, expected letters, digits, '_' and '-'")
+        shape = {name: tuple(size) for name, size in shape.items()}
+    elif shape is not None:
+        shape = tuple(shape)
+    for field, size in by_field(shape).items():
+        if not is_image_shape(size):
+            raise ValueError(f"{field}: got the shape {size!r:.100}, expected two whole numbers")
+    return shape

@@ -1,6 +1,7 @@
 """Imports a LeRobot data set (version 3: parquet and MP4); neither LeRobot nor PyTorch is needed.
 
     python -m milx.data.lerobot PATH OUT --camera=observation.images.top
+    python -m milx.data.lerobot PATH OUT --camera=observation.images.wrist,observation.images.scene
     python -m milx.data.lerobot PATH OUT --state=observation.state --action=action --task=tasks.json
 
 PATH is the data set's folder, the one with meta/ and data/. A task is what the episodes say (--task=task_index), a data
@@ -19,12 +20,14 @@ from absl import app
 from PIL import Image
 
 from milx.core import files
+from milx.data import cameras
 from milx.data import episodes as shared
 from milx.data.dataset import check_size
-from milx.data.episodes import Episode, Sizes
+from milx.data.episodes import Contents, Episode
 from milx.data.mapping import lookup, read_mapping
-from milx.types import Demo
+from milx.types import Demo, by_field
 
+_IMAGES, _NUMBERS = ("video", "image"), ("float32", "float64", "int64")
 _CONVERTER = "python -m lerobot.datasets.v30.convert_dataset_v21_to_v30"
 _BATCH_BYTES = 1 << 30
 _PLACEHOLDER = re.compile(r"\{(\w+)(?::0?(\d)d)?\}")
@@ -35,8 +38,8 @@ class LeRobot:
 
     Args:
         root: its folder.
-        camera: the feature that holds images; "" for none, None for the only one.
-        state: the feature that holds the robot's state; "" for none.
+        camera: the feature that holds images, or several separated by commas; "" for none, None for the only one.
+        state: the features that together are the robot's state, separated by commas; "" for none.
         action: the feature that holds actions; "" for none.
         height: maximum number of rows of an image; larger ones are shrunk.
 
@@ -46,15 +49,16 @@ class LeRobot:
     """
 
     def __init__(self, root: str | pathlib.Path, camera: str | None, state: str, action: str, height: int):
-        self.root, self.height = pathlib.Path(root), height
+        self.root = pathlib.Path(root)
         self.info = self._read_info()
-        self.camera = self._only_camera() if camera is None else camera
-        self.state, self.action = state, action
-        image_shape = None
-        if self.camera:
-            image_shape = shared.shrunk(self._shape(self.camera, ("video", "image"), 3)[:2], height)
-        vector = lambda name: self._shape(name, ("float32", "float64", "int64"), 1)[0] if name else 0  # noqa: E731
-        self.sizes = Sizes(image_shape, vector(state), vector(action))
+        self.cameras = cameras.named(self._only_camera() if camera is None else camera)
+        self.vectors = {"state": [name for name in state.split(",") if name], "action": [action] if action else []}
+        image_shape = cameras.joined(
+            {name: cameras.shrunk(self._shape(key, _IMAGES, 3), height) for name, key in self.cameras.items()}
+        )
+        names = {field: sum((self._names(key) for key in keys), ()) for field, keys in self.vectors.items()}
+        sizes = len(names["state"]), len(names["action"])
+        self.contents = Contents(image_shape, *sizes, self.info["fps"], names["state"], names["action"])
 
     def episodes(self, task: str) -> list[Episode]:
         """Lists all episodes.
@@ -71,20 +75,20 @@ class LeRobot:
             else:
                 name = file.relative_to(self.root).as_posix() if task == "file" else str(row["tasks"][0])
             read = functools.partial(self._read, row, file)
-            found.append(Episode(name, row["length"], bool(self.action), read))
+            found.append(Episode(name, row["length"], bool(self.vectors["action"]), read, str(row["tasks"][0])))
         return found
 
     def _read(self, row: dict[str, Any], file: pathlib.Path) -> Demo:
         length, number = row["length"], row["episode_index"]
-        is_video = bool(self.camera) and self.info["features"][self.camera]["dtype"] == "video"
-        columns = ("episode_index", self.state, self.action, "" if is_video else self.camera)
-        table = _read_table(file, tuple(name for name in columns if name))
+        pictures = [key for key in self.cameras.values() if not self._is_video(key)]
+        columns = ("episode_index", *self.vectors["state"], *self.vectors["action"], *pictures)
+        table = _read_table(file, tuple(dict.fromkeys(columns)))
         kept = np.flatnonzero(table["episode_index"].to_numpy() == number)
         if len(kept) != length:
             raise ValueError(f"{file}: got {len(kept)} rows of episode {number}, expected {length}")
 
-        def vectors(name: str, size: int) -> np.ndarray:
-            values = table[name].take(kept).to_pylist()
+        def vector(name: str) -> np.ndarray:
+            values, size = table[name].take(kept).to_pylist(), len(self._names(name))
             try:
                 return np.array(values, np.float32).reshape(length, size)
             except (ValueError, TypeError) as error:
@@ -92,19 +96,24 @@ class LeRobot:
                     f"{file}: {name} of episode {number}: expected {size} numbers a row ({error})"
                 ) from error
 
-        state = vectors(self.state, self.sizes.state) if self.state else None
-        action = vectors(self.action, self.sizes.action) if self.action else None
-        image = None
-        if self.sizes.image_shape is not None:
-            check_size(f"{self.camera} of episode {number}", (length, *self.sizes.image_shape, 3), 1)
-            frames = self._video(row) if is_video else _images(file, table[self.camera].take(kept).to_pylist())
-            image = np.stack(list(shared.resized(frames, self.sizes.image_shape)))
-        return Demo(image, state, action)
+        def images(key: str, shape: tuple[int, int]) -> np.ndarray:
+            check_size(f"{key} of episode {number}", (length, *shape, 3), 1)
+            frames = self._video(row, key) if self._is_video(key) else _images(file, table[key].take(kept).to_pylist())
+            return np.stack(list(cameras.resized(frames, shape)))
 
-    def _video(self, row: dict[str, Any]) -> Iterator[np.ndarray]:
-        """Reads the episode's part of its video file."""
-        prefix = f"videos/{self.camera}"
-        values = {"video_key": self.camera}
+        found = {name: [vector(key) for key in keys] for name, keys in self.vectors.items()}
+        state, action = (np.concatenate(values, axis=1) if values else None for values in found.values())
+        shapes = by_field(self.contents.image_shape).values()
+        seen = {name: images(key, shape) for (name, key), shape in zip(self.cameras.items(), shapes, strict=True)}
+        return Demo(cameras.joined(seen), state, action)
+
+    def _is_video(self, camera: str) -> bool:
+        return self.info["features"][camera]["dtype"] == "video"
+
+    def _video(self, row: dict[str, Any], camera: str) -> Iterator[np.ndarray]:
+        """Reads the episode's part of a camera's video file."""
+        prefix = f"videos/{camera}"
+        values = {"video_key": camera}
         values |= {name: row[f"{prefix}/{name}"] for name in ("chunk_index", "file_index")}
         file = files.inside(self.root, _fill(self.info["video_path"], values))
         yield from read_video(file, row[f"{prefix}/from_timestamp"], row["length"], self.info["fps"])
@@ -112,8 +121,8 @@ class LeRobot:
     def _rows(self) -> list[dict[str, Any]]:
         """Reads what meta/episodes says of every episode, in order."""
         columns = ["episode_index", "tasks", "length", "data/chunk_index", "data/file_index"]
-        if self.camera and self.info["features"][self.camera]["dtype"] == "video":
-            prefix = f"videos/{self.camera}"
+        for camera in filter(self._is_video, self.cameras.values()):
+            prefix = f"videos/{camera}"
             columns += [f"{prefix}/chunk_index", f"{prefix}/file_index", f"{prefix}/from_timestamp"]
         rows = []
         for path in sorted((self.root / "meta" / "episodes").glob("*/*.parquet")):
@@ -172,10 +181,19 @@ class LeRobot:
         return info
 
     def _only_camera(self) -> str:
-        cameras = [name for name, feature in self.info["features"].items() if feature["dtype"] in ("video", "image")]
-        if len(cameras) > 1:
-            raise ValueError(f"camera: expected one of {', '.join(cameras)}, or none with --camera=")
-        return cameras[0] if cameras else ""
+        found = [name for name, feature in self.info["features"].items() if feature["dtype"] in _IMAGES]
+        if len(found) > 1:
+            raise ValueError(f"camera: expected one or several of {','.join(found)}, or none with --camera=")
+        return found[0] if found else ""
+
+    def _names(self, feature: str) -> tuple[str, ...]:
+        """Names the entries of a vector, by number if the data set does not name them."""
+        size, short = self._shape(feature, _NUMBERS, 1)[0], feature.rpartition(".")[2]
+        names = self.info["features"][feature].get("names")
+        if isinstance(names, dict) and len(names) == 1:  # {"motors": [...]}
+            (names,) = names.values()
+        good = isinstance(names, list) and len(names) == size and all(isinstance(name, str) for name in names)
+        return tuple(names) if good else tuple(f"{short}.{i}" for i in range(size))
 
     def _shape(self, name: str, dtypes: tuple[str, ...], axes: int) -> tuple[int, ...]:
         features = self.info["features"]

@@ -12,7 +12,7 @@ import numpy as np
 from milx.data.dataset import DataSet, spread
 from milx.data.frames import frame_indices
 from milx.data.goals import with_goals
-from milx.types import Array, Demo, TaskBatch
+from milx.types import Array, Demo, TaskBatch, by_field, from_fields
 
 MOST_DEMOS = 16
 """Demonstrations of a task that are on the device at once; of more, some are drawn."""
@@ -39,7 +39,8 @@ class Recorded:
 def shape_of(data: DataSet, num_tasks: int, num_demos: int, horizon: int) -> Recorded:
     """Returns shapes and types of `read_demos`'s result."""
     lead, head = (num_tasks, num_demos, horizon), data.header
-    image = None if head.image_shape is None else jax.ShapeDtypeStruct((*lead, *head.image_shape, 3), np.uint8)
+    shapes = by_field(head.image_shape)
+    image = from_fields({name: jax.ShapeDtypeStruct((*lead, *size, 3), np.uint8) for name, size in shapes.items()})
     state, action = (jax.ShapeDtypeStruct((*lead, size), np.float32) for size in (head.state_size, head.action_size))
     which = jax.ShapeDtypeStruct(lead[:2], np.bool_)
     return Recorded(jax.ShapeDtypeStruct((num_tasks,), np.int32), Demo(image, state, action), which, which)
@@ -65,9 +66,10 @@ def read_demos(data: DataSet, tasks: Sequence[int], demos: Sequence[Sequence[int
     for n, d, finish in pending:
         demo = finish()
         whole.there[n, d], whole.acts[n, d] = True, demo.action is not None
-        for field in ("image", "state", "action"):
-            if (value := getattr(demo, field)) is not None:
-                getattr(whole.demo, field)[n, d] = value
+        read, room = (by_field(x.image) | {"state": x.state, "action": x.action} for x in (demo, whole.demo))
+        for field, value in read.items():
+            if value is not None:
+                room[field][n, d] = value
     return whole
 
 

@@ -18,11 +18,12 @@ from absl import app
 
 from milx.core import files
 from milx.core.files import FileError
+from milx.data import cameras
 from milx.data import episodes as shared
 from milx.data.dataset import check_size
-from milx.data.episodes import Episode, Sizes
+from milx.data.episodes import Contents, Episode
 from milx.data.mapping import lookup, read_mapping
-from milx.types import Demo
+from milx.types import Demo, by_field
 
 
 class Robomimic:
@@ -30,7 +31,7 @@ class Robomimic:
 
     Args:
         path: a file, or a folder of *.hdf5 files.
-        camera: the observation that holds images; "" for none, None for the only one.
+        camera: the observation that holds images, or several separated by commas; "" for none, None for the only one.
         state: observations that together are the robot's state, separated by commas; "" for none.
         action: the data set that holds the actions; "" for none.
         height: maximum number of rows of an image; larger ones are shrunk.
@@ -49,12 +50,14 @@ class Robomimic:
         self.state, self.action = [name for name in state.split(",") if name], action
         with _open(self.files[0]) as file:
             demo = _demos(file)[0]
-            self.camera = self._only_camera(file, demo) if camera is None else camera
+            self.cameras = cameras.named(self._only_camera(file, demo) if camera is None else camera)
             lead = f"data/{demo}/obs"
-            shape = _dataset(file, f"{lead}/{self.camera}", 4).shape[1:] if self.camera else None
-            size = sum(_dataset(file, f"{lead}/{name}", 2).shape[1] for name in self.state)
+            shape = lambda key: cameras.shrunk(_dataset(file, f"{lead}/{key}", 4).shape[1:], height)  # noqa: E731
+            image_shape = cameras.joined({name: shape(key) for name, key in self.cameras.items()})
+            sizes = {name: _dataset(file, f"{lead}/{name}", 2).shape[1] for name in self.state}
             actions = _dataset(file, f"data/{demo}/{action}", 2).shape[1] if action else 0
-        self.sizes = Sizes(None if shape is None else shared.shrunk(shape, height), size, actions)
+        names = tuple(f"{name}.{i}" for name, size in sizes.items() for i in range(size))
+        self.contents = Contents(image_shape, len(names), actions, state_names=names)
 
     def episodes(self, task: str) -> list[Episode]:
         """Lists all demonstrations.
@@ -76,8 +79,7 @@ class Robomimic:
     def _names(self, demo: str) -> dict[str, int]:
         """Names the data sets that are read of a demonstration, and their axes."""
         names = {f"data/{demo}/obs/{name}": 2 for name in self.state}
-        if self.camera:
-            names[f"data/{demo}/obs/{self.camera}"] = 4
+        names |= {f"data/{demo}/obs/{key}": 4 for key in self.cameras.values()}
         if self.action:
             names[f"data/{demo}/{self.action}"] = 2
         return names
@@ -93,20 +95,20 @@ class Robomimic:
             lead = f"data/{demo}"
             action = _dataset(file, f"{lead}/{self.action}", 2)[:] if self.action else None
             states = [_dataset(file, f"{lead}/obs/{name}", 2)[:] for name in self.state]
-            image = None
-            if self.sizes.image_shape is not None:
-                frames = _dataset(file, f"{lead}/obs/{self.camera}", 4)
+            shapes, images = by_field(self.contents.image_shape).values(), {}
+            for (name, key), shape in zip(self.cameras.items(), shapes, strict=True):
+                frames = _dataset(file, f"{lead}/obs/{key}", 4)
                 if frames.dtype != np.uint8 or frames.shape[-1] != 3:
                     got = f"{frames.dtype} {list(frames.shape)}"
                     raise FileError(f"{path}: {frames.name}: got {got}, expected uint8 [T, H, W, 3]")
-                image = np.stack(list(shared.resized(iter(frames), self.sizes.image_shape)))
-            return Demo(image, np.concatenate(states, axis=1) if states else None, action)
+                images[name] = np.stack(list(cameras.resized(frames, shape)))
+            return Demo(cameras.joined(images), np.concatenate(states, axis=1) if states else None, action)
 
     def _only_camera(self, file: Any, demo: str) -> str:
-        cameras = [name for name in _members(file, f"data/{demo}/obs") if name.endswith("_image")]
-        if len(cameras) > 1:
-            raise FileError(f"camera: expected one of {', '.join(cameras)}, or none with --camera=")
-        return cameras[0] if cameras else ""
+        found = [name for name in _members(file, f"data/{demo}/obs") if name.endswith("_image")]
+        if len(found) > 1:
+            raise FileError(f"camera: expected one or several of {','.join(found)}, or none with --camera=")
+        return found[0] if found else ""
 
 
 @contextlib.contextmanager

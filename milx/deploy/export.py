@@ -19,7 +19,7 @@ from milx.core import files
 from milx.data.goals import with_goals
 from milx.deploy import standalone
 from milx.deploy.policy import Policy
-from milx.types import Demo, Observation, Params, Spec
+from milx.types import Demo, Observation, Params, Spec, by_field, from_fields, is_image
 
 PLATFORMS = ("cpu", "cuda")
 
@@ -86,21 +86,24 @@ def input_shapes(policy: Policy, shots: int) -> dict[str, dict[str, list[int]]]:
     """Returns the shapes of the fields that "adapt" and "act" take, by program and field."""
     spec, config = policy.spec, policy.config
     seen = {"state": [spec.state_size]} if spec.state_size else {}
-    if spec.image_shape is not None:
-        seen["image"] = [*spec.image_shape, 3]
+    seen |= {name: [*size, 3] for name, size in by_field(spec.image_shape).items()}
     shown = seen | {"action": [spec.action_size]}
-    hidden = {GIVEN[0]: (), GIVEN[1]: ("action",), GIVEN[2]: ("action", "state")}[config.method.given]
+    hidden: tuple[str, ...] = {GIVEN[0]: (), GIVEN[1]: ("action",), GIVEN[2]: ("action", "state")}[config.method.given]
     adapt = {name: [shots, policy.horizon, *shape] for name, shape in shown.items() if name not in hidden}
     return {"adapt": adapt, "act": seen}
 
 
-def _with_state(fields: dict[str, jax.Array], spec: Spec) -> dict[str, jax.Array]:
-    """Adds an empty state to the fields if the policy uses no states."""
-    return fields if spec.state_size else {**fields, "state": jnp.zeros((*fields["image"].shape[:-3], 0))}
+def _with_state(fields: dict[str, jax.Array], spec: Spec) -> dict[str, Any]:
+    """Joins the images of several cameras, and adds an empty state if the policy uses no states."""
+    image = from_fields(fields)
+    others = {name: value for name, value in fields.items() if not is_image(name)}
+    if not spec.state_size:
+        others["state"] = jnp.zeros((*jax.tree.leaves(image)[0].shape[:-3], 0))
+    return {"image": image, **others}
 
 
 def _dtype(field: str) -> Any:
-    return np.uint8 if field == "image" else np.float32
+    return np.uint8 if is_image(field) else np.float32
 
 
 def _program(function: Any, *args: Any) -> bytes:

@@ -17,7 +17,7 @@ from milx.core.checkpoint import Checkpoints
 from milx.core.files import FileError
 from milx.data.goals import with_goals
 from milx.methods import Method
-from milx.types import SPEC_FILE, Array, Demo, Memory, Observation, Params, Spec, TaskParams
+from milx.types import SPEC_FILE, Array, Demo, Memory, Observation, Params, Spec, TaskParams, by_field, from_fields
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -47,8 +47,8 @@ class Policy:
 
         Args:
             params: `policy.params`.
-            demo: images [..., T, H, W, 3] uint8 (None for a policy that sees no pixels), states [..., T, S] and actions
-                [..., T, A], as NumPy or JAX arrays.
+            demo: images [..., T, H, W, 3] uint8 (of several cameras a dictionary by name; None for a policy that sees
+                no pixels), states [..., T, S] and actions [..., T, A], as NumPy or JAX arrays.
 
         Returns:
             The parameters adapted to the task (`task_params`), for `act` and `step`.
@@ -185,14 +185,16 @@ def check_demo(demo: Demo, spec: Spec, given: str = GIVEN[0]) -> Demo:
     without_actions = "state" if spec.state_size else "image"
     leading = {"video+state+action": "action", "video+state": without_actions, "video": "image"}[given]
     axes = {"action": ("A",), "state": ("S",), "image": ("H", "W", "3")}[leading]
-    first = _as_array(f"demo.{leading}", getattr(demo, leading))
+    shown = by_field(demo.image) if leading == "image" else {leading: getattr(demo, leading)}
+    leading, value = next(iter(shown.items()), (leading, None))
+    first = _as_array(f"demo.{leading}", value)
     lead = first.ndim - len(axes) - 1
     if lead not in (0, 1) or 0 in first.shape:
         size = ", ".join(axes)
         expected = f"[T, {size}] or [K, T, {size}] with at least one time step"
         raise ValueError(f"demo.{leading}: got shape {list(first.shape)}, expected {expected}")
     shape = first.shape[: lead + 1]
-    checked = Demo(_check_image("demo.image", demo.image, shape, spec))
+    checked = Demo(_check_image("demo", demo.image, shape, spec))
     if given != "video":
         state = _check_state("demo.state", demo.state, shape, spec)
         checked = dataclasses.replace(checked, state=state)
@@ -224,7 +226,7 @@ def check_observation(observation: Observation, spec: Spec) -> Observation:
     if not isinstance(observation, Observation):
         raise ValueError(f"observation: got {type(observation).__name__}, expected a milx.Observation")
     return Observation(
-        image=_check_image("observation.image", observation.image, (), spec),
+        image=_check_image("observation", observation.image, (), spec),
         state=_check_state("observation.state", observation.state, (), spec),
     )
 
@@ -238,15 +240,22 @@ def _as_array(field: str, value: Any) -> Any:
         raise ValueError(f"{field}: got {type(value).__name__}, expected an array ({error})") from error
 
 
-def _check_image(field: str, value: Any, lead: tuple[int, ...], spec: Spec) -> jax.Array | np.ndarray | None:
-    if spec.image_shape is None:
+def _check_image(what: str, value: Any, lead: tuple[int, ...], spec: Spec) -> Any:
+    """Checks the images of all cameras; `what` shows them."""
+    wanted = by_field(spec.image_shape)
+    if not wanted:
         if value is not None:
-            raise ValueError(f"{field}: got {type(value).__name__}, expected None: this policy sees no pixels")
+            raise ValueError(f"{what}.image: got {type(value).__name__}, expected None: this policy sees no pixels")
         return None
-    array = _check_shape(field, value, (*lead, *spec.image_shape, 3))
-    if array.dtype != np.uint8:
-        raise ValueError(f"{field}: got {array.dtype}, expected uint8 in [0, 255]")
-    return array
+    if isinstance(spec.image_shape, dict) and value is not None and set(by_field(value)) != set(wanted):
+        got = f"the cameras {', '.join(sorted(value))}" if isinstance(value, dict) else type(value).__name__
+        raise ValueError(f"{what}.image: got {got}, expected a dictionary of {', '.join(spec.image_shape)}")
+    checked, given = {}, by_field(value)
+    for name, size in wanted.items():
+        checked[name] = _check_shape(f"{what}.{name}", given.get(name), (*lead, *size, 3))
+        if checked[name].dtype != np.uint8:
+            raise ValueError(f"{what}.{name}: got {checked[name].dtype}, expected uint8 in [0, 255]")
+    return from_fields(checked)
 
 
 def _check_state(field: str, value: Any, lead: tuple[int, ...], spec: Spec) -> Array:

@@ -57,9 +57,10 @@ class Policy:
         """Adapts to a task from one demonstration, or from several of the same length.
 
         Args:
-            **demo: "image" uint8 [T, H, W, 3], "state" [T, S] and "action" [T, A]; exactly those that `sizes["adapt"]`
-                lists. T may be any number of time steps; the demonstration is resampled to the policy's number, at
-                even intervals. With K > 1 demonstrations, all fields have a leading axis K.
+            **demo: "image" uint8 [T, H, W, 3], of several cameras a dictionary by name, "state" [T, S] and "action"
+                [T, A]; exactly those that `sizes["adapt"]` lists. T may be any number of time steps; the demonstration
+                is resampled to the policy's number, at even intervals. With K > 1 demonstrations, all fields have a
+                leading axis K.
 
         Returns:
             The parameters adapted to the task (`task_params`), for `act` and `step`.
@@ -86,7 +87,8 @@ class Policy:
 
         Args:
             task_params: the parameters that `adapt` returned.
-            **observation: "image" uint8 [H, W, 3] and "state" [S]; exactly those that `sizes["act"]` lists.
+            **observation: "image" uint8 [H, W, 3], of several cameras a dictionary by name, and "state" [S]; exactly
+                those that `sizes["act"]` lists.
 
         Raises:
             ValueError: for a field that is missing, not expected, or has a wrong shape or type, or a value that is not
@@ -121,6 +123,9 @@ class Policy:
 
     @staticmethod
     def _checked(values: dict, wanted: dict, lead: int) -> dict[str, np.ndarray]:
+        if isinstance(cameras := values.get("image"), dict):
+            values = {name: value for name, value in values.items() if name != "image"}
+            values |= {f"image.{camera}": value for camera, value in cameras.items()}
         if set(values) != set(wanted):
             raise ValueError(f"fields: got {sorted(values)}, expected {sorted(wanted)}")
         checked = {}
@@ -129,13 +134,12 @@ class Policy:
             entries = value.shape[value.ndim - len(shape) + lead :]
             if entries != shape[lead:] or value.ndim not in (len(shape), len(shape) - bool(lead)) or 0 in value.shape:
                 raise ValueError(f"{name}: got shape {list(value.shape)}, expected [..., {str(list(shape[lead:]))[1:]}")
-            if (value.dtype == np.uint8) != (name == "image"):
-                raise ValueError(
-                    f"{name}: got {value.dtype}, expected {'uint8' if name == 'image' else 'real numbers'}"
-                )
+            is_image = name.partition(".")[0] == "image"
+            if (value.dtype == np.uint8) != is_image:
+                raise ValueError(f"{name}: got {value.dtype}, expected {'uint8' if is_image else 'real numbers'}")
             if not np.isfinite(value).all():
                 raise ValueError(f"{name}: got values that are not finite")
-            checked[name] = value if name == "image" else value.astype(np.float32)
+            checked[name] = value if is_image else value.astype(np.float32)
         return checked
 
 

@@ -20,6 +20,7 @@ from milx.networks.encoders import (
     RecurrentConfig,
     make_context_network,
 )
+from milx.networks.policy_network import goal_camera
 from milx.types import Demo, Memory, Observation, Params, Spec, TaskBatch, TaskParams
 
 
@@ -115,7 +116,7 @@ def make_lstm_attention(config: Config, spec: Spec) -> ContextPolicy:
 
 
 def _actor(network: ContextConfig, spec: Spec) -> Actor:
-    return Actor(network, spec.action_size, goal_size=len(spec.goal_indices))
+    return Actor(network, spec.action_size, len(spec.goal_indices), goal_camera(spec.image_shape))
 
 
 def _with_context(config: Config, spec: Spec, network: ContextNetwork) -> ContextPolicy:

@@ -17,7 +17,7 @@ def shown(demo: Demo, given: str, whitening: Whitening) -> Demo:
     """Replaces what is not `given` (`MethodConfig.given`) of demonstrations [K, T, ...] by its mean."""
     if given == GIVEN[0]:
         return demo
-    shape = (demo.state if demo.image is None else demo.image).shape[:2]
+    shape = jax.tree.leaves(demo)[0].shape[:2]
     action = jnp.broadcast_to(whitening.action_mean, (*shape, *whitening.action_mean.shape))
     if given == GIVEN[1]:
         return dataclasses.replace(demo, action=action)

@@ -16,8 +16,8 @@ import numpy as np
 from milx.config.schema import LARGEST_SIZE, VisionConfig, number
 from milx.networks.goal import StateGoalHead
 from milx.networks.layers import Dense
-from milx.networks.policy_network import Controller, ConvStack, PolicyOutput
-from milx.types import Params, Spec
+from milx.networks.policy_network import Controller, PolicyOutput, listed, see
+from milx.types import Params, Spec, black
 
 
 @dataclasses.dataclass
@@ -48,7 +48,7 @@ class ContextNetwork(NamedTuple):
     Attributes:
         init: key -> params.
         encode: (params, image [T, H, W, 3] uint8 or None, whitened state [T, S], whitened action [T, A]) -> context, a
-            pytree: what is kept of a demonstration.
+            pytree: what is kept of a demonstration. With several cameras `image` is a dictionary of images by name.
         apply: (params, context, image [B, H, W, 3] uint8 or None, whitened state [B, S]) -> PolicyOutput.
     """
 
@@ -63,12 +63,11 @@ class LastFrame(nn.Module):
     config: ContextConfig
 
     @nn.compact
-    def __call__(self, image: jax.Array | None, state: jax.Array, action: jax.Array) -> jax.Array:
+    def __call__(self, image: Any, state: jax.Array, action: jax.Array) -> jax.Array:
         """Encodes as `ContextNetwork.encode` says; ignores the actions."""
         last = state[-1:]
-        if image is not None:
-            features = ConvStack(self.config, name="vision")(image[-1:], state.dtype)
-            last = jnp.concatenate([features.reshape(1, -1), last], axis=-1)
+        features = see(self.config, jax.tree.map(lambda x: x[-1:], image), state.dtype)
+        last = jnp.concatenate([*(x.reshape(1, -1) for x in listed(features)), last], axis=-1)
         return Dense(self.config.context, hidden=True, norm=self.config.fc_norm)(last)[0]
 
 
@@ -81,13 +80,13 @@ class Recurrent(nn.Module):
     config: RecurrentConfig
 
     @nn.compact
-    def __call__(self, image: jax.Array | None, state: jax.Array, action: jax.Array) -> jax.Array:
+    def __call__(self, image: Any, state: jax.Array, action: jax.Array) -> jax.Array:
         """Encodes as `ContextNetwork.encode` says."""
         index = np.linspace(0, len(state) - 1, min(len(state), self.config.context_frames)).round().astype(int)
         parts = [state[index], action[index]]
         if image is not None:
-            features = ConvStack(self.config, name="vision")(image[index], state.dtype)
-            flat = features.reshape(len(features), -1)
+            features = listed(see(self.config, jax.tree.map(lambda x: x[index], image), state.dtype))
+            flat = jnp.concatenate([x.reshape(len(x), -1) for x in features], axis=-1)
             parts.append(Dense(self.config.fc_layers[0], hidden=True, norm=self.config.fc_norm)(flat))
         cell = nn.OptimizedLSTMCell(self.config.context, param_dtype=state.dtype)
         return nn.RNN(cell, name="lstm")(jnp.concatenate(parts, axis=-1))[-1]
@@ -99,18 +98,24 @@ class Actor(nn.Module):
     config: VisionConfig
     action_size: int
     goal_size: int
+    goal_camera: str | None = None
 
     @nn.compact
-    def __call__(self, context: jax.Array, image: jax.Array | None, state: jax.Array) -> PolicyOutput:
+    def __call__(self, context: jax.Array, image: Any, state: jax.Array) -> PolicyOutput:
         """Acts as `ContextNetwork.apply` says."""
-        features = query = None
-        if image is not None:
-            features = ConvStack(self.config, name="vision")(image, state.dtype)
+        features, query = see(self.config, image, state.dtype), None
         if self.config.goal_head:
-            size = StateGoalHead.candidates if features is None else features.shape[-1]
+            size = StateGoalHead.candidates if features is None else listed(features)[0].shape[-1]
             query = jnp.broadcast_to(Dense(size)(context), (len(state), size))
-        vision = self.config.soft_argmax, self.config.goal_head
-        controller = Controller(self.config, self.action_size, self.goal_size, *vision, name="controller")
+        controller = Controller(
+            self.config,
+            self.action_size,
+            self.goal_size,
+            self.config.soft_argmax,
+            self.config.goal_head,
+            goal_camera=self.goal_camera,
+            name="controller",
+        )
         return controller(features, state, jnp.broadcast_to(context, (len(state), *context.shape)), query)
 
 
@@ -124,7 +129,7 @@ def make_context_network(encoder: nn.Module, actor: nn.Module, spec: Spec) -> Co
     """
 
     def init(key: jax.Array) -> Params:
-        image = None if spec.image_shape is None else jnp.zeros((1, *spec.image_shape, 3), jnp.uint8)
+        image = black(spec.image_shape, (1,))
         state, action = jnp.zeros((1, spec.state_size)), jnp.zeros((1, spec.action_size))
         encoder_key, actor_key = jax.random.split(key)
         context, encoding = encoder.init_with_output(encoder_key, image, state, action)
@@ -133,10 +138,10 @@ def make_context_network(encoder: nn.Module, actor: nn.Module, spec: Spec) -> Co
             "actor": actor.init(actor_key, context, image, state)["params"],
         }
 
-    def encode(params: Params, image: jax.Array | None, state: jax.Array, action: jax.Array) -> Any:
+    def encode(params: Params, image: Any, state: jax.Array, action: jax.Array) -> Any:
         return encoder.apply({"params": params["encoder"]}, image, state, action)
 
-    def apply(params: Params, context: Any, image: jax.Array | None, state: jax.Array) -> PolicyOutput:
+    def apply(params: Params, context: Any, image: Any, state: jax.Array) -> PolicyOutput:
         output = actor.apply({"params": params["actor"]}, context, image, state)
         assert isinstance(output, PolicyOutput)
         return output

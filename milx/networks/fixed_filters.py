@@ -74,17 +74,15 @@ def _read(file: pathlib.Path) -> dict[str, np.ndarray]:
         raise ValueError(f"network.fixed_filters: {file} cannot be read: {error}") from error
 
 
-def cluster(images: np.ndarray, config: ConvConfig) -> Filters:
+def cluster(images: list[np.ndarray], config: ConvConfig) -> Filters:
     """Makes filters of the clusters of the images' patches; the same for the same images.
 
     Args:
-        images: [N, H, W, 3] uint8.
+        images: [N, H, W, 3] uint8 of every camera.
         config: how many filters, and their size.
     """
     rng, size, count = np.random.default_rng(0), config.kernel, config.filters[0]
-    windows = np.lib.stride_tricks.sliding_window_view(images, (size, size), axis=(1, 2))
-    index = [rng.integers(0, n, _PATCHES) for n in windows.shape[:3]]
-    patches = windows[tuple(index)].transpose(0, 2, 3, 1).reshape(_PATCHES, -1) / 255.0
+    patches = np.concatenate([_patches(each, size, _PATCHES // len(images), rng) for each in images]) / 255.0
     centered = patches - patches.mean(axis=1, keepdims=True)
     spread = centered.std(axis=1, keepdims=True)
     normal = (centered / np.sqrt(spread**2 + 1e-2))[spread[:, 0] > 1e-3]  # flat patches tell nothing
@@ -108,6 +106,13 @@ def cluster(images: np.ndarray, config: ConvConfig) -> Filters:
     scale = (centered @ weights).std(axis=0)
     kernel = (weights / scale).reshape(size, size, 3, count)
     return Filters(kernel.astype(np.float32), np.zeros(count, np.float32))
+
+
+def _patches(images: np.ndarray, size: int, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Draws patches [count, size * size * 3] of images [N, H, W, 3]."""
+    windows = np.lib.stride_tricks.sliding_window_view(images, (size, size), axis=(1, 2))
+    index = [rng.integers(0, n, count) for n in windows.shape[:3]]
+    return windows[tuple(index)].transpose(0, 2, 3, 1).reshape(count, -1)
 
 
 def put(params: Params, filters: Filters) -> Params:

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax
@@ -13,7 +13,7 @@ from milx.config.schema import LARGEST_SIZE, ConvConfig, NetworkConfig, VisionCo
 from milx.networks.goal import Goal, GoalHead, HindsightHead, StateGoalHead
 from milx.networks.layers import ConvBlock, Dense, FixedConv, SpatialSoftArgmax
 from milx.networks.learned_loss import LearnedLoss
-from milx.types import Params
+from milx.types import ImageShape, Params, black
 
 
 @dataclasses.dataclass
@@ -52,7 +52,8 @@ class PolicyOutput(NamedTuple):
         action: [B, A] of the head that acts, in the network's units.
         inner_action: [B, A] of the head that the inner loss sees; the same head if there is only one.
         goal: where the episode will end; None without a goal head.
-        feature_map: [B, H, W, C] what the convolutions make of the image; None where the policy sees no pixels.
+        feature_map: [B, H, W, C] what the convolutions make of the (first camera's) image; None where the policy sees
+            no pixels.
         features: [B, F] what the last layer sees in the inner loss.
         target: [B, G] whitened, as a target head has it; None without one.
     """
@@ -70,9 +71,10 @@ class PolicyNetwork(NamedTuple):
 
     Attributes:
         init: key -> params.
-        apply: (params, image [B, H, W, 3] uint8 or None, whitened state [B, S]) -> PolicyOutput. For a target head it
-            takes two more: `length`, as many consecutive images as show one episode, whose first tells the target of
-            all; and `target` [B, G], where it is known already, NaN where it is not.
+        apply: (params, image [B, H, W, 3] uint8 or None, whitened state [B, S]) -> PolicyOutput. With several cameras
+            `image` is a dictionary of images by name. For a target head it takes two more: `length`, as many
+            consecutive images as show one episode, whose first tells the target of all; and `target` [B, G], where it
+            is known already, NaN where it is not.
         learned_loss: (params, features [K, T, F]) -> [K], the loss of demonstrations without actions; None without one.
         hindsight: (params, feature maps of videos [K, T, H, W, C]) -> Goal, where the robot went in each; None without
             such a head.
@@ -105,8 +107,34 @@ class ConvStack(nn.Module):
         return x.astype(dtype)
 
 
+FeatureMaps = jax.Array | dict[str, jax.Array] | None
+"""A feature map [B, H', W', C]; with several cameras one for each by name, None where the policy sees no pixels."""
+
+
+def see(config: VisionConfig, image: Any, dtype: jnp.dtype) -> FeatureMaps:
+    """Applies the convolutions of the module that calls this: to images, those of each camera, or none."""
+    if image is None:
+        return None
+    if not isinstance(image, dict):
+        return ConvStack(config, name="vision")(image, dtype)
+    if config.share_encoder:
+        shared = ConvStack(config, name="vision")
+        return {camera: shared(image[camera], dtype) for camera in sorted(image)}
+    return {camera: ConvStack(config, name=f"vision_{camera}")(image[camera], dtype) for camera in sorted(image)}
+
+
+def listed(features: FeatureMaps) -> list[jax.Array]:
+    """Lists the feature maps of all cameras, in the order of their names."""
+    return jax.tree.leaves(features)
+
+
+def goal_camera(image_shape: ImageShape) -> str | None:
+    """Returns the camera that a goal head looks at, the first of several."""
+    return next(iter(image_shape)) if isinstance(image_shape, dict) else None
+
+
 class Controller(nn.Module):
-    """From a feature map and the robot's state to an action.
+    """From feature maps and the robot's state to an action.
 
     Attributes:
         config: its layers.
@@ -114,6 +142,7 @@ class Controller(nn.Module):
         goal_size: G; 0 for no goal head and no target head, whatever the following say.
         soft_argmax, goal_head: as in `VisionConfig`.
         heads, inner_first_layer, target_head: as in `PolicyConfig`.
+        goal_camera: with several cameras, the one whose features the goal head sees.
     """
 
     config: NetworkConfig
@@ -124,11 +153,12 @@ class Controller(nn.Module):
     heads: int = 1
     inner_first_layer: bool = False
     target_head: bool = False
+    goal_camera: str | None = None
 
     @nn.compact
     def __call__(
         self,
-        features: jax.Array | None,
+        features: FeatureMaps,
         state: jax.Array,
         context: jax.Array,
         query: jax.Array | None = None,
@@ -138,7 +168,7 @@ class Controller(nn.Module):
         """Acts.
 
         Args:
-            features: [B, H, W, C]; None where the policy sees no pixels.
+            features: [B, H, W, C] of one camera or several; None where the policy sees no pixels.
             state: [B, S] whitened.
             context: [B, D], joins the input of the first fully connected layer.
             query: [B, C] or, without features, [B, candidates]: tells the goal head what to look for; None for nothing.
@@ -148,7 +178,8 @@ class Controller(nn.Module):
         config, goal, seen_target = self.config, None, None
         parts, has_goal = [state, context], self.goal_head and self.goal_size
         if features is not None:
-            seen = SpatialSoftArgmax()(features) if self.soft_argmax else features.reshape(len(features), -1)
+            flat = (SpatialSoftArgmax()(x) if self.soft_argmax else x.reshape(len(x), -1) for x in listed(features))
+            seen = jnp.concatenate(list(flat), axis=-1)
             parts = [seen, *parts]
             if self.target_head and self.goal_size:
                 first = jnp.repeat(seen[::length], length, axis=0)
@@ -156,8 +187,9 @@ class Controller(nn.Module):
                 if target is not None:
                     seen_target = jnp.where(jnp.isnan(target), seen_target, target)
                 parts.append(seen_target)
+        main = features[self.goal_camera or min(features)] if isinstance(features, dict) else features
         if has_goal:
-            head, on = (StateGoalHead, state) if features is None else (GoalHead, features)
+            head, on = (StateGoalHead, state) if main is None else (GoalHead, main)
             goal = head(self.goal_size, name="goal_head")(on, query)
             parts.append(goal.mean)
         seen = jnp.concatenate(parts, axis=-1)
@@ -167,7 +199,7 @@ class Controller(nn.Module):
         x = inner = _through(layers, seen)
         if self.inner_first_layer:
             inner = _through([hidden(config.fc_layers[0], name="inner_first"), *layers[1:]], seen)
-        return PolicyOutput(heads[-1](x), heads[0](inner), goal, features, inner, seen_target)
+        return PolicyOutput(heads[-1](x), heads[0](inner), goal, main, inner, seen_target)
 
 
 def _through(layers: list[Dense], x: jax.Array) -> jax.Array:
@@ -178,16 +210,15 @@ class _Policy(nn.Module):
     config: PolicyConfig
     action_size: int
     goal_size: int
+    goal_camera: str | None
 
     @nn.compact
-    def __call__(
-        self, image: jax.Array | None, state: jax.Array, length: int = 1, target: jax.Array | None = None
-    ) -> PolicyOutput:
+    def __call__(self, image: Any, state: jax.Array, length: int = 1, target: jax.Array | None = None) -> PolicyOutput:
         # A learned constant joins the input of the first layer: its gradient gives the layer's bias a step of its own
         # (the paper's bias transformation, Section 4.1).
         config, size = self.config, self.config.bias_transformation
         z = self.param(BIAS_TRANSFORMATION, nn.initializers.zeros, (size,))
-        features = None if image is None else ConvStack(config, name="vision")(image, state.dtype)
+        features = see(config, image, state.dtype)
         controller = Controller(
             config,
             self.action_size,
@@ -197,25 +228,27 @@ class _Policy(nn.Module):
             heads=config.heads,
             inner_first_layer=config.inner_first_layer,
             target_head=config.target_head,
+            goal_camera=self.goal_camera,
             name="controller",
         )
         return controller(features, state, jnp.broadcast_to(z, (len(state), size)), None, length, target)
 
 
 def make_policy(
-    config: PolicyConfig, image_shape: tuple[int, int] | None, state_size: int, action_size: int, goal_size: int
+    config: PolicyConfig, image_shape: ImageShape, state_size: int, action_size: int, goal_size: int
 ) -> PolicyNetwork:
     """Builds the policy network.
 
     Args:
         config: layers and heads.
-        image_shape: (H, W); None where the policy sees no pixels.
+        image_shape: (H, W); with several cameras a dictionary of them by name, the first of which the goal head looks
+            at; None where the policy sees no pixels.
         state_size: S.
         action_size: A.
         goal_size: G, entries of the state that the goal head predicts.
     """
-    module = _Policy(config, action_size, goal_size)
-    image = None if image_shape is None else jnp.zeros((1, *image_shape, 3), jnp.uint8)
+    module = _Policy(config, action_size, goal_size, goal_camera(image_shape))
+    image = black(image_shape, (1,))
 
     loss, head = LearnedLoss(config.learned_loss or "linear"), HindsightHead(goal_size)
 
@@ -232,7 +265,7 @@ def make_policy(
 
     def apply(
         params: Params,
-        image: jax.Array | None,
+        image: Any,
         state: jax.Array,
         length: int = 1,
         target: jax.Array | None = None,

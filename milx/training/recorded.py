@@ -31,7 +31,7 @@ from milx.methods import whitening
 from milx.training.metrics import read_metrics
 from milx.training.run import Run
 from milx.training.state import Training
-from milx.types import SPEC_FILE, Demo, Params, Spec, TaskBatch
+from milx.types import SPEC_FILE, Demo, Params, Spec, TaskBatch, by_field
 from milx.worlds.client import Client
 from milx.worlds.evaluate import evaluate_in, tasks_of
 
@@ -44,9 +44,9 @@ def config_for(path: str | pathlib.Path, method: str = "mil", preset: str = "fas
     """
     config, head = assemble.make_config(RECORDED, method, preset, seed), DataSet(path).header
     config.recorded.path = str(pathlib.Path(path).resolve())
-    if head.image_shape is not None:
+    if isinstance(head.image_shape, tuple):
         config.env.image_shape = head.image_shape
-    elif isinstance(config.network, ConvConfig):
+    if head.image_shape is None and isinstance(config.network, ConvConfig):
         config.network.filters = config.network.strides = ()
         config.network.soft_argmax = config.network.mixed_precision = False
     return config
@@ -182,9 +182,9 @@ class RecordedRun(Run):
         at = lambda step: self.shards.at(step // self.config.train.log_every)  # noqa: E731
         return Training(dataset_hash, statistics, at, self._first_images)
 
-    def _first_images(self) -> np.ndarray:
+    def _first_images(self) -> list[np.ndarray]:
         first = [self.data.read(task, 0, np.zeros(1, int), fields=("image",)).image for task in self.shards.tasks[:128]]
-        return np.concatenate(first)
+        return list(by_field(jax.tree.map(lambda *images: np.concatenate(images), *first)).values())
 
     def _shapes(self) -> Recorded:
         return self.shards.shapes

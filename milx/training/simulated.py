@@ -82,9 +82,9 @@ def training_on(env: envs.Env, config: Config, train: DemoSet) -> Training:
         raise ValueError(f"data: at most {most} demonstrations of a task succeed, expected more than {shots}")
     statistics = whitening.fit(_robot_states(env, train.states), train.action, config.method.whiten_actions)
 
-    def first_images() -> np.ndarray:
+    def first_images() -> list[np.ndarray]:
         task, states = jax.tree.map(lambda x: x[:128], (train.task, train.states))
-        return np.asarray(jax.jit(jax.vmap(env.render))(task, jax.tree.map(lambda x: x[:, 0, 0], states)))
+        return [np.asarray(jax.jit(jax.vmap(env.render))(task, jax.tree.map(lambda x: x[:, 0, 0], states)))]
 
     return Training(pytrees.fingerprint(train), statistics, lambda _: train, first_images)
 

@@ -26,13 +26,13 @@ class Training(NamedTuple):
         dataset_hash: of the training demonstrations.
         whitening: their statistics.
         at: the data from which the scan that begins at a step draws its batches.
-        first_images: [N, H, W, 3] uint8, what some of the demonstrations show first.
+        first_images: [N, H, W, 3] uint8 of every camera, what some of the demonstrations show first.
     """
 
     dataset_hash: str
     whitening: Whitening
     at: Callable[[int], Any]
-    first_images: Callable[[], np.ndarray]
+    first_images: Callable[[], list[np.ndarray]]
 
 
 def check_steps(config: Config) -> None:

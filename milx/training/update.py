@@ -98,7 +98,7 @@ def meta_gradient(loss: Loss, params: Params, batch: TaskBatch) -> tuple[Params,
     def gradient(batch: TaskBatch) -> tuple[Params, dict[str, jax.Array]]:
         return jax.grad(loss, has_aux=True)(params, batch)
 
-    images = [demo.image for demo in (batch.support, batch.query) if demo.image is not None]
+    images = jax.tree.leaves((batch.support.image, batch.query.image))
     if jax.default_backend() != "cpu" or not images:
         return gradient(batch)
     at_once = _CPU_IMAGES // sum(image.shape[1] * image.shape[2] for image in images)

@@ -24,8 +24,9 @@ from rich.progress import track
 from milx.core.commands import command
 from milx.core.messages import warn
 from milx.data import episodes, splits
+from milx.data.cameras import fitted, shrunk
 from milx.data.dataset import Writer
-from milx.types import Demo
+from milx.types import Demo, by_field, from_fields
 from milx.worlds.client import Client, WorldError
 
 _ATTEMPTS = 2
@@ -115,12 +116,12 @@ def write(
     if first is None:
         raise ValueError(f"{source}: no task could be shown {demos} times, expected at least one")
     image, state, action = (getattr(first.demos[0], field) for field in ("image", "state", "action"))
-    shape = None if image is None else episodes.shrunk(image.shape[1:3], height)
+    shape = from_fields({name: shrunk(each.shape[1:3], height) for name, each in by_field(image).items()})
     sizes = shape, 0 if state is None else state.shape[1], action.shape[1]
     with Writer(out, *sizes, source) as writer:
         for task, shown, _ in itertools.chain([first], kept):
-            shrunk = [_shrunk(demo, shape) for demo in shown]
-            writer.add(task, split_of[task], [len(demo.action) for demo in shown], shrunk, families[task])
+            fitting = [Demo(fitted(demo.image, shape), demo.state, demo.action) for demo in shown]
+            writer.add(task, split_of[task], [len(demo.action) for demo in shown], fitting, families[task])
 
 
 def _is_complete(recorded: Recorded, demos: int) -> bool:
@@ -132,12 +133,7 @@ def _is_complete(recorded: Recorded, demos: int) -> bool:
 def _demo(task: str, arrays: dict[str, np.ndarray]) -> Demo:
     if "action" not in arrays:
         raise WorldError(f"{task}: demonstrate returned {sorted(arrays)}, expected an action, at least")
-    return Demo(arrays.get("image"), arrays.get("state"), arrays["action"])
-
-
-def _shrunk(demo: Demo, shape: tuple[int, int] | None) -> Demo:
-    image = None if shape is None else np.stack(list(episodes.resized(iter(demo.image), shape)))
-    return Demo(image, demo.state, demo.action)
+    return Demo(from_fields(arrays), arrays.get("state"), arrays["action"])
 
 
 def main(argv: list[str]) -> None:

@@ -18,6 +18,7 @@ from milx.deploy.policy import load_run
 from milx.evaluation import provenance
 from milx.evaluation.intervals import wilson_interval
 from milx.evaluation.plots import side_by_side
+from milx.types import by_field
 from milx.worlds.actor import CONTROLS
 from milx.worlds.evaluate import evaluate_in, tasks_of
 from milx.worlds.slot import Outcome, Task
@@ -62,8 +63,9 @@ def report_on(config: Config, folder: pathlib.Path, make: str, console: Console 
     )
     filmed = [outcome for outcome in outcomes if outcome.images]
     if filmed:
-        demos = [np.asarray(tasks[outcome.episode.task].demos[0].image) for outcome in filmed]
-        trials = [np.stack(outcome.images or []) for outcome in filmed]
+        first = lambda image: next(iter(by_field(image).values()))  # noqa: E731 - of several cameras
+        demos = [np.asarray(first(tasks[outcome.episode.task].demos[0].image)) for outcome in filmed]
+        trials = [np.stack([first(image) for image in outcome.images or []]) for outcome in filmed]
         longest = max(map(len, demos + trials))
         side_by_side(_same_length(demos, longest), _same_length(trials, longest), folder / VIDEO)
     console.print(table(found))

@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from milx.data.episodes import resized, shrunk
+from milx.data.cameras import fitted
 from milx.deploy.policy import check_observation
-from milx.types import Demo, Observation, Spec
+from milx.types import Demo, Observation, Spec, black, from_fields
 from milx.worlds.client import Client, WorldError
 
 
@@ -44,7 +44,8 @@ class Outcome:
         end: whether it was done at the end.
         steps: how many were done.
         lost: why the episode could not be finished; None if it was. It does not count as a success.
-        images: [H, W, 3] uint8 each, what was seen, of an episode that is filmed; else None.
+        images: [H, W, 3] uint8 each, what was seen (with several cameras by name), of an episode that is filmed; else
+            None.
     """
 
     episode: Episode
@@ -52,7 +53,7 @@ class Outcome:
     end: bool = False
     steps: int = 0
     lost: str | None = None
-    images: list[np.ndarray] | None = None
+    images: list[Any] | None = None
 
 
 class Slot:
@@ -138,21 +139,12 @@ class Slot:
             self.outcome.images.append(image)
 
 
-def _parts(arrays: dict[str, np.ndarray], spec: Spec) -> tuple[np.ndarray | None, np.ndarray | None]:
+def _parts(arrays: dict[str, np.ndarray], spec: Spec) -> tuple[Any, np.ndarray | None]:
     """Takes what a policy sees out of an observation or a demonstration; larger images are shrunk as at import."""
-    image, state = arrays.get("image"), arrays.get("state")
-    if (
-        spec.image_shape is not None
-        and image is not None
-        and (image.ndim >= 3 and image.shape[-1] == 3 and image.dtype == np.uint8)
-        and shrunk(image.shape[-3:], spec.image_shape[0]) == spec.image_shape
-    ):
-        frames = image.reshape(-1, *image.shape[-3:])
-        image = np.stack(list(resized(iter(frames), spec.image_shape))).reshape(*image.shape[:-3], *spec.image_shape, 3)
-    state = np.asarray(state, np.float32) if spec.state_size and state is not None else None
-    return image if spec.image_shape is not None else None, state
+    state = arrays.get("state")
+    seen = np.asarray(state, np.float32) if spec.state_size and state is not None else None
+    return fitted(from_fields(arrays), spec.image_shape), seen
 
 
 def _nothing(spec: Spec) -> Observation:
-    image = None if spec.image_shape is None else np.zeros((*spec.image_shape, 3), np.uint8)
-    return Observation(image, np.zeros(spec.state_size, np.float32) if spec.state_size else None)
+    return Observation(black(spec.image_shape), np.zeros(spec.state_size, np.float32) if spec.state_size else None)

@@ -4,7 +4,8 @@
 
 `function(task)` returns a Gymnasium environment in which the task of that name is to be done. Its observations are
 dictionaries with "image", uint8 [H, W, 3], or "state", real numbers [S], or both; LeRobot's names "pixels" and
-"agent_pos" mean the same. An array alone is an image if it looks like one, and a state otherwise.
+"agent_pos" mean the same. "image" may be a dictionary of the images of several cameras by name, which are called
+"image.NAME" in messages. An array alone is an image if it looks like one, and a state otherwise.
 `info["is_success"]`, or else `info["success"]`, tells after every step whether the task is done. Actions are those of a
 `gymnasium.spaces.Box`, to whose limits they are clipped. An environment may have a method `demonstrate(seed)`, which
 returns a demonstration as a dictionary with the arrays "image", "state" and "action", [T, ...], and raises an error if
@@ -96,7 +97,7 @@ class World:
         env = self._of(task)
         while env is not None and not hasattr(type(env), "demonstrate"):
             env = getattr(env, "env", None)
-        return {}, {} if env is None else {name: np.asarray(value) for name, value in env.demonstrate(seed).items()}
+        return {}, {} if env is None else _by_field(env.demonstrate(seed))
 
     def tasks(self):
         """Lists the tasks."""
@@ -134,14 +135,21 @@ def _seen(observation):
     for part, names in NAMES.items():
         for name in names:
             if name in observation and part not in found:
-                value = observation[name]
-                if isinstance(value, dict):
-                    if len(value) != 1:
-                        raise ValueError(f"{name}: has {sorted(value)}, expected one camera")
-                    (value,) = value.values()
-                found[part] = np.asarray(value)
+                found[part] = observation[name]
     if not found:
         raise ValueError(f"observation: has {sorted(observation)}, expected image, state or both")
+    return _by_field(found)
+
+
+def _by_field(parts):
+    """Makes arrays of an observation's or a demonstration's parts; the only one of a dictionary needs no name."""
+    found: dict[str, np.ndarray] = {}
+    for name, value in parts.items():
+        several = isinstance(value, dict) and len(value) > 1
+        each = {f"{name}.{key}": one for key, one in value.items()} if several else {name: value}
+        if isinstance(value, dict) and not several:
+            (each[name],) = value.values()
+        found.update((key, np.asarray(one)) for key, one in each.items())
     return found
 
 

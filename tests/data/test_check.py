@@ -82,7 +82,7 @@ def test_the_description_counts_and_measures(tmp_path):
     check.describe(data, console)
     text = console.export_text()
     assert "4 tasks, 9 demonstrations, from a test" in text
-    assert "images 8 x 8; 10 to 12 steps" in text
+    assert "image 8 x 8; 10 to 12 steps" in text
     assert "train: 2 tasks: task 0, task 3" in text
     column = check.vectors(data)["action"][:, 1]
     row = next(line for line in text.splitlines() if "action[1]" in line)

@@ -173,7 +173,7 @@ def test_what_goes_wrong_half_way_leaves_nothing_and_can_be_begun_again(tmp_path
     [
         (lambda h: h.update(version=99), "version: got 99, expected 1"),
         (lambda h: h.pop("tasks"), "tasks"),
-        (lambda h: h.update(image_shape=[24, 10**9]), "sizes: got image_shape"),
+        (lambda h: h.update(image_shape=[24, 10**9]), "image: got the shape"),
         (lambda h: h["tasks"][0].update(split="dev"), r"tasks\[0\].split: got 'dev', expected one of train"),
         (lambda h: h["tasks"][1].update(lengths=[-3]), r"tasks\[1\].lengths: got \[-3\], expected positive"),
         (lambda h: h["tasks"][1].update(has_action=[]), r"tasks\[1\].has_action: got 0, expected 1"),

@@ -71,10 +71,12 @@ def test_every_episode_is_read_as_it_was_written(camera):
 
 def test_an_import_is_a_data_set(tmp_path):
     source = open_set(height=24)
-    episodes.write(tmp_path / "out", source.episodes("task_index"), source.sizes, (0.3, 0.4), "there")
+    episodes.write(tmp_path / "out", source.episodes("task_index"), source.contents, (0.3, 0.4), "there")
     data = DataSet(tmp_path / "out")
     assert data.header.image_shape == (24, 32)
     assert [task.name for task in data.header.tasks] == sorted(make_lerobot.TASKS)
+    assert (data.header.fps, data.header.action_names) == (make_lerobot.FPS, ("x", "y", "grip"))
+    assert all(set(task.instructions) == {task.name} for task in data.header.tasks)
     assert sorted(task.split for task in data.header.tasks) == ["test", "train", "validation"]
     for i, task in enumerate(data.header.tasks):
         own = [n for n, (t, _) in enumerate(make_lerobot.EPISODES) if make_lerobot.TASKS[t] == task.name]
@@ -91,6 +93,19 @@ def test_an_import_is_a_data_set(tmp_path):
     assert "first image is of one color" in problems, "that of the first episode"
 
 
+def test_several_cameras_and_parts_of_the_state_are_imported_together():
+    """Compares with what is imported one by one; actions stand in for another part of the state."""
+    both = open_set(camera=f"{TOP},{WRIST}", state="observation.state,action", height=24)
+    assert both.contents.image_shape == {"top": (24, 32), "wrist": (16, 16)}
+    assert both.contents.state_names == ("a", "b", "c", "d", "x", "y", "grip")
+    top, wrist = open_set(camera=TOP, height=24), open_set(camera=WRIST)
+    for together, *apart in zip(*(each.episodes("task_index") for each in (both, top, wrist)), strict=True):
+        demo, *single = (each.read() for each in (together, *apart))
+        np.testing.assert_array_equal(demo.image["top"], single[0].image)
+        np.testing.assert_array_equal(demo.image["wrist"], single[1].image)
+        np.testing.assert_array_equal(demo.state, np.concatenate([single[0].state, single[0].action], axis=1))
+
+
 def test_files_or_a_mapping_make_tasks(tmp_path):
     by_file = [episode.task for episode in open_set().episodes("file")]
     assert by_file[:4] == ["data/chunk-000/file-000.parquet"] * 2 + ["data/chunk-000/file-001.parquet"] * 2
@@ -104,17 +119,17 @@ def test_files_or_a_mapping_make_tasks(tmp_path):
 
 def test_states_and_actions_may_lack():
     source = open_set(camera="", action="")
-    assert source.sizes == (None, 4, 0)
+    assert source.contents == (None, 4, 0, make_lerobot.FPS, ("a", "b", "c", "d"), ())
     (demo,) = (episode.read() for episode in source.episodes("task_index")[:1])
     assert demo.image is None
     assert demo.action is None
-    assert open_set(state="").sizes.state == 0
+    assert open_set(state="").contents.state_size == 0
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"camera": None}, f"camera: expected one of {TOP}, {WRIST}"),
+        ({"camera": None}, f"camera: expected one or several of {TOP},{WRIST}"),
         ({"camera": "front"}, "feature: got 'front', expected one of observation.state"),
         ({"camera": "action"}, r"feature 'action': got float32 \[3\], expected video or image with 3 axes"),
         ({"state": TOP}, "expected float32 or float64 or int64 with 1 axes"),

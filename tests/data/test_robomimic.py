@@ -31,7 +31,7 @@ def copy(tmp_path):
 def test_an_import_is_a_data_set(tmp_path):
     """Makes a task of each file, with demonstrations in the order of their numbers and states side by side."""
     source = open_set(height=10)
-    episodes.write(tmp_path / "out", source.episodes("file"), source.sizes, (0.0, 0.5), "there")
+    episodes.write(tmp_path / "out", source.episodes("file"), source.contents, (0.0, 0.5), "there")
     data = DataSet(tmp_path / "out")
     assert [task.name for task in data.header.tasks] == ["lift", "stack"]
     assert sorted(task.split for task in data.header.tasks) == ["test", "train"]
@@ -121,5 +121,5 @@ def test_observations_that_do_not_exist_are_named(copy, tmp_path):
         open_set(tmp_path / "none")
     with h5py.File(copy, "a") as file:
         file["data/demo_0/obs/wrist_image"] = np.zeros((7, 2, 2, 3), np.uint8)
-    with pytest.raises(ValueError, match="camera: expected one of agentview_image, wrist_image"):
+    with pytest.raises(ValueError, match="camera: expected one or several of agentview_image,wrist_image"):
         open_set(copy)

@@ -7,7 +7,7 @@ import pytest
 
 from milx.data import episodes
 from milx.data.dataset import DataSet
-from milx.data.episodes import Episode, Sizes
+from milx.data.episodes import Contents, Episode
 from milx.data.splits import assign_splits, by_family, choose, families_of, read_patterns
 from milx.types import Demo
 
@@ -72,7 +72,7 @@ def test_an_import_keeps_families_and_chosen_splits(tmp_path):
     for number, (rule, expected) in enumerate((("prefix", "door"), (str(tmp_path / "families.json"), "do"), ("", ""))):
         families, chosen = families_of(names, rule), read_patterns(tmp_path / "splits.json")
         out = tmp_path / str(number)
-        episodes.write(out, found, Sizes(None, 2, 2), (0.1, 0.1), "a test", families, chosen)
+        episodes.write(out, found, Contents(None, 2, 2), (0.1, 0.1), "a test", families, chosen)
         tasks = DataSet(out).header.tasks
         assert [(task.name, task.split) for task in tasks] == [
             ("door/1", "train"),

@@ -28,20 +28,21 @@ SPEC = Spec(
 @pytest.mark.parametrize("name", ["mil", "contextual", "lstm", "lstm_attention"])
 def test_every_field_of_a_methods_networks_is_read(name, monkeypatch):
     """Traces the meta-training loss where there are images, goals and objects, and collects what is read."""
-    config, read = default_config(name), set()
+    config, read, spec = default_config(name), set(), SPEC
+    image = jnp.zeros((2, 1, 3, *IMAGE_SHAPE, 3), jnp.uint8)
     if isinstance(config.network, ConvConfig):
         config.network.goal_head = True
+        spec, image = dataclasses.replace(SPEC, image_shape=dict.fromkeys("ab", IMAGE_SHAPE)), {"a": image, "b": image}
 
     def record(self, field):
         read.add(field)
         return object.__getattribute__(self, field)
 
     monkeypatch.setattr(type(config.network), "__getattribute__", record, raising=False)
-    method = methods.make(config, SPEC)
-    image = jnp.zeros((2, 1, 3, *IMAGE_SHAPE, 3), jnp.uint8)
+    method = methods.make(config, spec)
     state, action, goal = (jnp.zeros((2, 1, 3, size)) for size in (STATE, ACTION, 2))
     demo = Demo(image, state, action, goal)
-    jax.eval_shape(method.loss, methods.params_like(method, SPEC), TaskBatch(demo, demo))
+    jax.eval_shape(method.loss, methods.params_like(method, spec), TaskBatch(demo, demo))
     assert {field.name for field in dataclasses.fields(config.network)} <= read
 
 

@@ -70,7 +70,7 @@ def scene(seed):
 
 def test_the_bank_answers_to_what_the_images_show_and_not_to_brightness():
     config = dataclasses.replace(CONFIG, filters=(12, 4))
-    filters = fixed_filters.cluster(scene(0), config)
+    filters = fixed_filters.cluster([scene(0)], config)
     assert np.abs(filters.kernel.sum(axis=(0, 1, 2))).max() < 1e-4  # a flat gray patch gives nothing
     windows = np.lib.stride_tricks.sliding_window_view(scene(1) / 255.0, (3, 3), axis=(1, 2))
     windows = windows[:, :22, :22].transpose(0, 1, 2, 4, 5, 3).reshape(-1, 27)
@@ -83,7 +83,7 @@ def test_the_bank_answers_to_what_the_images_show_and_not_to_brightness():
     # No two are alike.
     kernel = filters.kernel.reshape(27, -1) / np.linalg.norm(filters.kernel.reshape(27, -1), axis=0)
     assert (kernel.T @ kernel - np.eye(12)).max() < 0.999
-    again = fixed_filters.cluster(scene(0), config)
+    again = fixed_filters.cluster([scene(0)], config)
     np.testing.assert_array_equal(filters.kernel, again.kernel)
 
 

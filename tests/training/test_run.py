@@ -108,7 +108,7 @@ def test_a_fixed_first_layer_is_made_from_what_the_training_demonstrations_show_
     state, _ = initial_state(trainer, config, training_on(trained.run.env, config, trained.train))
     first = jax.tree.map(lambda x: x[:, 0, 0], trained.train.states)
     images = jax.jit(jax.vmap(trained.run.env.render))(trained.train.task, first)
-    expected = fixed_filters.cluster(np.asarray(images), config.network)
+    expected = fixed_filters.cluster([np.asarray(images)], config.network)
     layer = state.params["policy"]["vision"]["ConvBlock_0"]
     np.testing.assert_array_equal(layer["fixed_kernel"], expected.kernel)
     assert np.abs(expected.kernel).max() > 0.1
