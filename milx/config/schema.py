@@ -146,6 +146,9 @@ class MethodConfig:
         loss_scale: factor by which the errors of the actions are multiplied before they are squared.
         whiten_actions: let the network predict actions that are whitened to zero mean and unit variance.
         goal_weight: weight of the goal head's negative log likelihoods, or of the target head's squared error.
+        chunk: number of time steps whose actions the policy predicts at once; only for recorded demonstrations.
+        execute: number of actions that are executed of a chunk before the next chunk counts; 0 for the mean of what all
+            chunks say of a time step (`milx.methods.chunks`).
         given: the parts of a demonstration of a new task that the policy is shown, one of GIVEN. In meta-training,
             query demonstrations always have all parts.
     """
@@ -153,6 +156,8 @@ class MethodConfig:
     loss_scale: float = number(1.0, 0)
     whiten_actions: bool = False
     goal_weight: float = number(0.0, 0)
+    chunk: int = number(1, 1, 1000)
+    execute: int = number(1, 0, 1000)
     given: str = GIVEN[0]
 
 

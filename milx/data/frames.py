@@ -4,6 +4,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from milx.types import Array
+
+
+def next_frames(frames: np.ndarray, length: int, chunk: int) -> np.ndarray:
+    """Lists for each of these time steps [T] itself and those after it, [T, chunk]; the last one is repeated."""
+    return np.minimum(frames[:, None] + np.arange(chunk), length - 1)
+
+
+def in_chunks(action: Array, chunk: int) -> Array:
+    """Puts actions [..., T, A] of the next time steps side by side, [..., T, chunk A]; the last one is repeated."""
+    length = action.shape[-2]
+    return action[..., next_frames(np.arange(length), length, chunk), :].reshape(*action.shape[:-1], -1)
+
 
 def frame_indices(key: jax.Array, length: int, count: int | None, exponent: float = 1.0) -> jax.Array:
     """Draws n = `count` increasing time steps below T = `length`, one from each of n - 1 parts, and the last one.

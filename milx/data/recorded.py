@@ -2,15 +2,15 @@
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from milx.data.dataset import DataSet, spread
-from milx.data.frames import frame_indices
+from milx.data.dataset import ALL_FIELDS, DataSet, spread
+from milx.data.frames import frame_indices, next_frames
 from milx.data.goals import with_goals
 from milx.types import Array, Demo, TaskBatch, by_field, from_fields
 
@@ -36,17 +36,40 @@ class Recorded:
     acts: Array
 
 
-def shape_of(data: DataSet, num_tasks: int, num_demos: int, horizon: int) -> Recorded:
+def read_later(
+    data: DataSet, task: int, demo: int, horizon: int, chunk: int, fields: tuple[str, ...] = ALL_FIELDS
+) -> Callable[[], Demo]:
+    """Starts reading a demonstration, resampled to T = `horizon` steps; the result is a function that waits for it.
+
+    Its actions [T, chunk A] are those of the next `chunk` time steps before it was resampled.
+    """
+    length = data.header.tasks[task].lengths[demo]
+    frames = spread(length, horizon)
+    seen = data.read_later(task, demo, frames, tuple(field for field in fields if field != "action"))
+    done = data.read_later(task, demo, next_frames(frames, length, chunk).ravel(), ("action",))
+
+    def finish() -> Demo:
+        action = done().action
+        shaped = None if action is None else action.reshape(horizon, -1)
+        return dataclasses.replace(seen(), action=shaped)
+
+    return finish
+
+
+def shape_of(data: DataSet, num_tasks: int, num_demos: int, horizon: int, chunk: int) -> Recorded:
     """Returns shapes and types of `read_demos`'s result."""
     lead, head = (num_tasks, num_demos, horizon), data.header
     shapes = by_field(head.image_shape)
     image = from_fields({name: jax.ShapeDtypeStruct((*lead, *size, 3), np.uint8) for name, size in shapes.items()})
-    state, action = (jax.ShapeDtypeStruct((*lead, size), np.float32) for size in (head.state_size, head.action_size))
+    sizes = head.state_size, chunk * head.action_size
+    state, action = (jax.ShapeDtypeStruct((*lead, size), np.float32) for size in sizes)
     which = jax.ShapeDtypeStruct(lead[:2], np.bool_)
     return Recorded(jax.ShapeDtypeStruct((num_tasks,), np.int32), Demo(image, state, action), which, which)
 
 
-def read_demos(data: DataSet, tasks: Sequence[int], demos: Sequence[Sequence[int]], horizon: int) -> Recorded:
+def read_demos(
+    data: DataSet, tasks: Sequence[int], demos: Sequence[Sequence[int]], horizon: int, chunk: int = 1
+) -> Recorded:
     """Reads demonstrations, all at once, as NumPy arrays.
 
     Args:
@@ -54,15 +77,15 @@ def read_demos(data: DataSet, tasks: Sequence[int], demos: Sequence[Sequence[int
         tasks: N task numbers.
         demos: the numbers of the demonstrations of each; D is the most of them.
         horizon: T.
+        chunk: time steps whose actions stand side by side.
     """
-    like = shape_of(data, len(tasks), max(len(chosen) for chosen in demos), horizon)
+    like = shape_of(data, len(tasks), max(len(chosen) for chosen in demos), horizon, chunk)
     whole = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), like)
     whole.number[:] = tasks
     pending = []
     for n, (task, chosen) in enumerate(zip(tasks, demos, strict=True)):
         for d, number in enumerate(chosen):
-            frames = spread(data.header.tasks[task].lengths[number], horizon)
-            pending.append((n, d, data.read_later(task, number, frames)))
+            pending.append((n, d, read_later(data, task, number, horizon, chunk)))
     for n, d, finish in pending:
         demo = finish()
         whole.there[n, d], whole.acts[n, d] = True, demo.action is not None
@@ -136,17 +159,21 @@ class Shards:
         gib: room for a shard; two are on the device at times.
         seed: draws the shards.
         acting: at least so many demonstrations of a task that show actions are in a shard, if it has as many.
+        chunk: time steps whose actions stand side by side.
 
     Raises:
         ValueError: if not even one task fits.
     """
 
-    def __init__(self, data: DataSet, tasks: Sequence[int], horizon: int, gib: float, seed: int, acting: int):
+    def __init__(
+        self, data: DataSet, tasks: Sequence[int], horizon: int, gib: float, seed: int, acting: int, chunk: int = 1
+    ):
         self.data, self.tasks, self.horizon, self.seed = data, list(tasks), horizon, seed
-        self.acting = acting
+        self.acting, self.chunk = acting, chunk
         most = max(len(data.header.tasks[i].lengths) for i in self.tasks)
         self.num_demos = min(most, MOST_DEMOS)
-        of_task = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(shape_of(data, 1, self.num_demos, horizon)))
+        one = shape_of(data, 1, self.num_demos, horizon, chunk)
+        of_task = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(one))
         if of_task > gib * 2**30:
             raise ValueError(f"recorded.gib: got {gib}, expected at least {of_task / 2**30:.3g}, the size of a task")
         self.num_tasks = min(len(self.tasks), int(gib * 2**30 // of_task))
@@ -157,7 +184,7 @@ class Shards:
     @functools.cached_property
     def shapes(self) -> Recorded:
         """Shapes and types of a shard."""
-        return shape_of(self.data, self.num_tasks, self.num_demos, self.horizon)
+        return shape_of(self.data, self.num_tasks, self.num_demos, self.horizon, self.chunk)
 
     def at(self, scan: int) -> Recorded:
         """Returns the shard of a scan, and begins to read the next one's."""
@@ -171,7 +198,7 @@ class Shards:
 
     def _load(self, scan: int) -> Recorded:
         tasks, demos = self.chosen(scan)
-        loaded = read_demos(self.data, tasks, demos, self.horizon)
+        loaded = read_demos(self.data, tasks, demos, self.horizon, self.chunk)
         fill = self.num_demos - loaded.there.shape[1]  # as large as every shard
         pad = lambda x: np.pad(x, [(0, 0), (0, fill)] + [(0, 0)] * (x.ndim - 2)) if x.ndim > 1 else x  # noqa: E731
         return jax.device_put(jax.tree.map(pad, loaded))

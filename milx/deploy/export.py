@@ -73,12 +73,13 @@ def export(policy: Policy, out: str | pathlib.Path, shots: int = 1) -> None:
     }
     arrays = {f"{i:04d}": np.asarray(leaf) for i, leaf in enumerate(leaves)}
     arrays |= {f"memory{i:04d}": np.asarray(leaf) for i, leaf in enumerate(memory)}
+    header = {"format": standalone.FORMAT, "inputs": sizes, "chunk": policy.config.method.chunk}
     with files.creating(folder) as partial:
         for name, program in programs.items():
             files.write_bytes(partial / f"{name}.bin", program)
         files.write_arrays(partial / "params.npz", arrays, compress=False)
         digests = {path.name: files.sha256(path) for path in sorted(partial.iterdir())}
-        files.write_json(partial / "policy.json", {"format": standalone.FORMAT, "inputs": sizes, "sha256": digests})
+        files.write_json(partial / "policy.json", header | {"sha256": digests})
         files.write_bytes(partial / "policy.py", files.read_bytes(pathlib.Path(standalone.__file__).resolve()))
 
 
@@ -87,7 +88,7 @@ def input_shapes(policy: Policy, shots: int) -> dict[str, dict[str, list[int]]]:
     spec, config = policy.spec, policy.config
     seen = {"state": [spec.state_size]} if spec.state_size else {}
     seen |= {name: [*size, 3] for name, size in by_field(spec.image_shape).items()}
-    shown = seen | {"action": [spec.action_size]}
+    shown = seen | {"action": [config.method.chunk * spec.action_size]}
     hidden: tuple[str, ...] = {GIVEN[0]: (), GIVEN[1]: ("action",), GIVEN[2]: ("action", "state")}[config.method.given]
     adapt = {name: [shots, policy.horizon, *shape] for name, shape in shown.items() if name not in hidden}
     return {"adapt": adapt, "act": seen}

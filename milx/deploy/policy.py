@@ -15,6 +15,8 @@ from milx.config.schema import GIVEN, Config
 from milx.core import files
 from milx.core.checkpoint import Checkpoints
 from milx.core.files import FileError
+from milx.data.dataset import spread
+from milx.data.frames import in_chunks
 from milx.data.goals import with_goals
 from milx.methods import Method
 from milx.types import SPEC_FILE, Array, Demo, Memory, Observation, Params, Spec, TaskParams, by_field, from_fields
@@ -43,7 +45,8 @@ class Policy:
     def adapt(self, params: Params, demo: Demo) -> TaskParams:
         """Adapts to a task from one demonstration [T, ...] or several [K, T, ...]; the computation is jitted.
 
-        Inside `jax.jit`, `jax.vmap` and `jax.grad` it is a pure function, and values are not checked.
+        Inside `jax.jit`, `jax.vmap` and `jax.grad` it is a pure function, and values are not checked. A policy that was
+        trained on recorded demonstrations resamples the demonstrations to its `horizon` by selecting time steps.
 
         Args:
             params: `policy.params`.
@@ -57,7 +60,20 @@ class Policy:
             ValueError: for a field that is missing or has a wrong shape or type, an image for a policy that sees no
                 pixels, a value that is not finite, or an action outside the environment's limits.
         """
-        return self._adapt(params, check_demo(demo, self.spec, self.config.method.given))
+        return self._adapt(params, self.prepared(demo))
+
+    def prepared(self, demo: Demo) -> Demo:
+        """Checks demonstrations, and makes of them [K, T, ...] what `Method.adapt` takes.
+
+        Raises:
+            ValueError: as `adapt`.
+        """
+        demo = check_demo(demo, self.spec, self.config.method.given)
+        if demo.action is not None:
+            demo = dataclasses.replace(demo, action=in_chunks(demo.action, self.config.method.chunk))
+        if not self.config.recorded.path:
+            return demo
+        return jax.tree.map(lambda x: x[:, spread(x.shape[1], self.horizon)], demo)
 
     def act(self, task_params: TaskParams, observation: Observation) -> jax.Array:
         """Returns the action [A], in the environment's units, for one observation; the computation is jitted.

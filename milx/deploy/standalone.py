@@ -31,6 +31,7 @@ class Policy:
 
     Attributes:
         sizes: the shapes of the inputs, by field: [K, T, ...] for "adapt" and [...] for "act".
+        chunk: the number of time steps whose actions "adapt" takes side by side, and the policy predicts at once.
         params: the learned parameters.
         initial_memory: the memory at the start of an episode; empty for most policies.
 
@@ -40,7 +41,7 @@ class Policy:
 
     def __init__(self, folder: str | os.PathLike):
         folder = pathlib.Path(folder)
-        self.sizes, digests = _read_header(folder / "policy.json")
+        self.sizes, digests, self.chunk = _read_header(folder / "policy.json")
         names = ("params.npz", "adapt.bin", "act.bin")
         params, *programs = (_read(folder / name, digests.get(name)) for name in names)
         with np.load(io.BytesIO(params), allow_pickle=False) as arrays:
@@ -69,13 +70,17 @@ class Policy:
             ValueError: for a field that is missing, not expected, or has a wrong shape or type, a value that is not
                 finite, or another number of demonstrations than the policy was exported for.
         """
-        wanted = self.sizes["adapt"]
-        values, lengths = {}, {}
+        wanted, values, lengths = dict(self.sizes["adapt"]), {}, {}
+        if "action" in wanted:
+            wanted["action"] = [*wanted["action"][:-1], wanted["action"][-1] // self.chunk]
         for name, value in self._checked(demo, wanted, lead=2).items():
             value = value.reshape(-1, *value.shape[-len(wanted[name]) + 1 :])
             shots, steps = wanted[name][:2]
             if len(value) != shots:
                 raise ValueError(f"{name}: got {len(value)} demonstrations, expected {shots}")
+            if name == "action":
+                after = np.arange(value.shape[1])[:, None] + np.arange(self.chunk)
+                value = value[:, np.minimum(after, value.shape[1] - 1)].reshape(*value.shape[:2], -1)
             values[name] = value[:, np.linspace(0, value.shape[1] - 1, steps).round().astype(int)]
             lengths[name] = value.shape[1]
         if len(set(lengths.values())) > 1:
@@ -151,8 +156,8 @@ def _check_inputs(path: pathlib.Path, name: str, fields: dict, takes: tuple, aft
         raise ValueError(f"{path}: {name}: got {fields}, expected {named}, which the program takes")
 
 
-def _read_header(path: pathlib.Path) -> tuple[dict, dict]:
-    """Reads the shapes of the inputs, and the SHA-256 of the other files by name."""
+def _read_header(path: pathlib.Path) -> tuple[dict, dict, int]:
+    """Reads the shapes of the inputs, the SHA-256 of the other files by name, and the length of a chunk."""
     try:
         values = json.loads(_content(path))
         if values["format"] != FORMAT:
@@ -162,7 +167,10 @@ def _read_header(path: pathlib.Path) -> tuple[dict, dict]:
             raise ValueError(f"inputs: got {inputs!r:.100}, expected the fields of adapt and of act")
         if not isinstance(digests, dict):
             raise ValueError(f"sha256: got {digests!r:.100}, expected hashes by the names of files")
-        return inputs, digests
+        chunk = values.get("chunk", 1)
+        if type(chunk) is not int or chunk < 1:
+            raise ValueError(f"chunk: got {chunk!r:.100}, expected a whole number, at least 1")
+        return inputs, digests, chunk
     except (KeyError, TypeError, ValueError, RecursionError) as error:
         raise ValueError(f"{path}: expected what the export of a policy writes: {error!r:.200}") from error
 

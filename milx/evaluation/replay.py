@@ -7,10 +7,11 @@ from milx.types import Demo, Memory, Observation, TaskParams
 
 
 def replay(method: Method, task_params: TaskParams, demo: Demo) -> jax.Array:
-    """Chooses actions [T, A] by an adapted policy on the observations of one demonstration [T, ...].
+    """Chooses actions [T, A], or chunks, by an adapted policy on the observations of one demonstration [T, ...].
 
     A policy that remembers sees them one after the other; any other sees them all at once.
     """
+    method = method.predictor
 
     def act(memory: Memory, seen: tuple) -> tuple[Memory, jax.Array]:
         action, memory = method.act(task_params, Observation(*seen), memory)

@@ -1,11 +1,14 @@
 """Methods by name, built from a configuration and the sizes of what they see and do."""
 
+import dataclasses
+
 import jax
 import numpy as np
 
 from milx.config.registry import METHODS, register_method
 from milx.config.schema import GIVEN, Config, ConvConfig
 from milx.methods.base import Method
+from milx.methods.chunks import Chunked
 from milx.methods.contextual import make_contextual, make_lstm, make_lstm_attention
 from milx.methods.mil import MILConfig, make_mil
 from milx.methods.whitening import Whitening
@@ -46,12 +49,16 @@ def make(config: Config, spec: Spec) -> Method:
     fixed = config.network.fixed_filters if isinstance(config.network, ConvConfig) else None
     if fixed is not None and spec.image_shape is None:
         raise ValueError(f"network.fixed_filters: got {fixed!r}, expected None: this policy sees no pixels")
-    method = entry.make(config, spec)
+    chunk, execute = config.method.chunk, config.method.execute
+    if execute > chunk:
+        raise ValueError(f"method.execute: got {execute}, expected at most method.chunk = {chunk}")
+    method = entry.make(config, dataclasses.replace(spec, action_size=chunk * spec.action_size))
     assert isinstance(method, Method)
-    return method
+    return method if chunk == 1 else Chunked(method, chunk, execute, spec.action_size)
 
 
 def params_like(method: Method, spec: Spec) -> Params:
     """Returns shapes and types of a method's parameters."""
-    state, action = (jax.ShapeDtypeStruct((size,), np.float32) for size in (spec.state_size, spec.action_size))
+    sizes = spec.state_size, method.chunk * spec.action_size
+    state, action = (jax.ShapeDtypeStruct((size,), np.float32) for size in sizes)
     return jax.eval_shape(method.init, jax.random.key(0), Whitening(state, state, action, action))

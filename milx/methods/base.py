@@ -14,6 +14,14 @@ class Method(abc.ABC):
     `params` is what meta-training learns; `task_params` is what the policy needs once it has seen a demonstration.
     """
 
+    chunk = 1
+    """C, the number of time steps whose actions demonstrations hold for each of theirs, one after the other."""
+
+    @property
+    def predictor(self) -> "Method":
+        """The method that predicts what demonstrations hold, and not what is executed of it; itself without chunks."""
+        return self
+
     @property
     def imitation_steps(self) -> int:
         """Number of meta-updates at the start that minimize `imitation` instead of `loss`."""

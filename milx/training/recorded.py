@@ -21,9 +21,9 @@ from milx.config.check import check_config
 from milx.config.schema import GIVEN, Config, ConvConfig
 from milx.core import files
 from milx.data import RECORDED
-from milx.data.dataset import DataSet, spread
+from milx.data.dataset import DataSet
 from milx.data.goals import with_goals
-from milx.data.recorded import MOST_DEMOS, Recorded, Shards, read_demos, sample_batch
+from milx.data.recorded import MOST_DEMOS, Recorded, Shards, read_demos, read_later, sample_batch
 from milx.deploy.policy import Policy, read_spec
 from milx.evaluation import plots
 from milx.evaluation.open_loop import task_errors
@@ -75,13 +75,14 @@ class Statistics(NamedTuple):
     action: np.ndarray
 
 
-def read_vectors(data: DataSet, tasks: list[int], horizon: int) -> Statistics:
+def read_vectors(data: DataSet, tasks: list[int], horizon: int, chunk: int = 1) -> Statistics:
     """Reads all states and actions of these tasks, resampled to the horizon.
 
     Args:
         data: the data set.
         tasks: numbers of the tasks.
         horizon: time steps to which each demonstration is resampled.
+        chunk: time steps whose actions stand side by side.
 
     Returns:
         The states of all demonstrations, and the actions of those that show them.
@@ -92,8 +93,8 @@ def read_vectors(data: DataSet, tasks: list[int], horizon: int) -> Statistics:
     states, actions = [], []
     for task in tasks:
         info = data.header.tasks[task]
-        for number, length in enumerate(info.lengths):
-            demo = data.read(task, number, spread(length, horizon), fields=("state", "action"))
+        for number in range(len(info.lengths)):
+            demo = read_later(data, task, number, horizon, chunk, ("state",))()
             for field, value in (("state", demo.state), ("action", demo.action)):
                 if value is not None and not (np.abs(value) <= LARGEST).all():
                     where = f"demonstration {number} of task {task} ({info.name!r})"
@@ -144,7 +145,8 @@ class RecordedRun(Run):
                 f"at least one with more than train.shots = {train.shots} demonstrations, of which one shows actions"
             )
             raise ValueError(f"data: {config.recorded.path} has no such training task, expected {expected}")
-        self.shards = Shards(self.data, tasks, settings.horizon, settings.gib, config.seed, train.shots + 1)
+        sizes = settings.horizon, settings.gib, config.seed, train.shots + 1, config.method.chunk
+        self.shards = Shards(self.data, tasks, *sizes)
 
         def sample(recorded: Recorded, keys: jax.Array) -> TaskBatch:
             frames = train.support_frames, train.query_frames, train.frame_exponent
@@ -165,7 +167,7 @@ class RecordedRun(Run):
 
     @functools.cached_property
     def _vectors(self) -> Statistics:
-        return read_vectors(self.data, self.shards.tasks, self.config.recorded.horizon)
+        return read_vectors(self.data, self.shards.tasks, self.config.recorded.horizon, self.config.method.chunk)
 
     def _load(self) -> Training:
         if make := self.config.evaluation.gym:
@@ -271,12 +273,12 @@ class RecordedRun(Run):
 
     def _task(self, task: int, shots: int) -> tuple[Recorded, Demo]:
         """Reads a task's queries [D, T, ...], and the first `shots` demonstrations that may be shown as the support."""
-        info, horizon = self.data.header.tasks[task], self.config.recorded.horizon
+        info, horizon, chunk = self.data.header.tasks[task], self.config.recorded.horizon, self.config.method.chunk
         # Those without actions first, where they will do: the others are to be asked.
         numbers = sorted(range(len(info.lengths)), key=lambda i: info.has_action[i] and not self.given_action)
         shown = [i for i in numbers if info.has_action[i] or not self.given_action][:shots]
         asked = [i for i in numbers if info.has_action[i] and i not in shown][: MOST_DEMOS - shots]
-        recorded = jax.tree.map(lambda x: x[0], read_demos(self.data, [task], [[*shown, *asked]], horizon))
+        recorded = jax.tree.map(lambda x: x[0], read_demos(self.data, [task], [[*shown, *asked]], horizon, chunk))
         support = jax.tree.map(lambda x: x[:shots], recorded.demo)
         fill = MOST_DEMOS - len(shown) - len(asked)
         rest = lambda x: np.pad(x[shots:], [(0, fill)] + [(0, 0)] * (x.ndim - 1))  # noqa: E731

@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from milx.data.dataset import spread
 from milx.deploy.policy import Policy
 from milx.types import Observation, TaskParams
 from milx.worlds.slot import Episode, Outcome, Task
@@ -38,6 +37,7 @@ class Actor:
         self._policy, self._tasks = policy, tasks
         self._others = [other_tasks(tasks, number) for number in range(len(tasks))]
         self._learned: dict[int | None, TaskParams] = {}
+        self._adapt = jax.jit(policy.method.adapt)
         first = self._learn(0)
         copies = lambda tree: jax.tree.map(lambda x: jnp.stack([x] * worlds), tree)  # noqa: E731
         self._task_params, self._memory = copies(first), copies(policy.initial_memory)
@@ -83,10 +83,7 @@ class Actor:
             if source is None:
                 self._learned[None] = policy.method.unadapted(policy.params)
             else:
-                demos = [
-                    jax.tree.map(lambda x: np.asarray(x)[spread(len(x), policy.horizon)], demo)
-                    for demo in self._tasks[source].demos
-                ]
-                shown = jax.tree.map(lambda *parts: np.stack(parts), *demos)
-                self._learned[source] = policy.adapt(policy.params, shown)
+                demos = [policy.prepared(demo) for demo in self._tasks[source].demos]
+                shown = jax.tree.map(lambda *parts: np.concatenate(parts), *demos)
+                self._learned[source] = self._adapt(policy.params, shown)
         return self._learned[source]
