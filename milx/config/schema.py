@@ -71,12 +71,16 @@ class RecordedConfig:
             values at the end of the demonstration.
         gib: device memory, in GiB, for the demonstrations from which one scan of meta-updates samples its batches.
             While a scan runs, the next scan's demonstrations are loaded, which can take as much memory again.
+        shift: maximum number of pixels by which the images of a demonstration are moved at random in training.
+        recolor: maximum relative change of the brightness of each of their channels in training.
     """
 
     path: str = ""
     horizon: int = number(50, 1, 100_000)
     goal_indices: tuple[int, ...] = number((), 0, 100_000)
     gib: float = number(2.0, 0, 100_000)
+    shift: int = number(0, 0, 1000)
+    recolor: float = number(0.0, 0, 1)
 
 
 @dataclasses.dataclass

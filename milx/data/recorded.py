@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from milx.data.augment import augmented
 from milx.data.dataset import ALL_FIELDS, DataSet, spread
 from milx.data.frames import frame_indices, next_frames
 from milx.data.goals import with_goals
@@ -105,6 +106,8 @@ def sample_batch(
     exponent: float,
     given_action: bool,
     goal_indices: tuple[int, ...],
+    shift: int = 0,
+    recolor: float = 0.0,
 ) -> TaskBatch:
     """Draws tasks and different demonstrations of each; the query is one that shows actions.
 
@@ -117,6 +120,8 @@ def sample_batch(
         exponent: see `frame_indices`.
         given_action: the support, too, must show actions.
         goal_indices: entries of the state that tell where the robot is (`milx.data.goals`).
+        shift: random changes of the images, others for every demonstration (`milx.data.augment`).
+        recolor: likewise.
     """
     support = recorded.acts if given_action else recorded.there
     enough = (recorded.acts.any(axis=1) & (support.sum(axis=1) > shots)).astype(jnp.float32)
@@ -133,7 +138,10 @@ def sample_batch(
         def show(d: jax.Array, key: jax.Array, frames: int | None) -> Demo:
             index = frame_indices(key, horizon, frames, exponent)
             demo = jax.tree.map(lambda x: x[n, d], recorded.demo)
-            return jax.tree.map(lambda x: x[index], with_goals(demo, goal_indices, None))
+            drawn = jax.tree.map(lambda x: x[index], with_goals(demo, goal_indices, None))
+            if not (shift or recolor):
+                return drawn
+            return dataclasses.replace(drawn, image=augmented(drawn.image, jax.random.fold_in(key, 1), shift, recolor))
 
         shown = [show(chosen[k], frame_keys[k], support_frames) for k in range(shots)]
         asked = show(query, frame_keys[shots], query_frames)

@@ -150,7 +150,9 @@ class RecordedRun(Run):
 
         def sample(recorded: Recorded, keys: jax.Array) -> TaskBatch:
             frames = train.support_frames, train.query_frames, train.frame_exponent
-            return sample_batch(recorded, keys, train.shots, *frames, self.given_action, tuple(settings.goal_indices))
+            changes = settings.shift, settings.recolor
+            indices = tuple(settings.goal_indices)
+            return sample_batch(recorded, keys, train.shots, *frames, self.given_action, indices, *changes)
 
         spec = spec_of(self.data, config)
         super().__init__(config, spec, sample, workdir, console)

@@ -1,0 +1,34 @@
+"""Random changes of recorded images in training: what was filmed once stands for other views and other lights."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+
+def augmented(image: Any, key: jax.Array, shift: int, recolor: float) -> Any:
+    """Changes the images of a demonstration, all of one camera alike.
+
+    Args:
+        image: [T, H, W, 3] uint8; of several cameras a dictionary by name, None for none.
+        key: draws the changes, others for every camera.
+        shift: the largest number of pixels by which images are moved down and to the right, or up and to the left; the
+            pixels at the edge are repeated (Yarats, Kostrikov and Fergus 2021).
+        recolor: every channel is multiplied by a factor between 1 - recolor and 1 + recolor.
+    """
+    leaves, structure = jax.tree.flatten(image)
+    keys = jax.random.split(key, max(len(leaves), 1))
+    changed = [_one_camera(x, key, shift, recolor) for x, key in zip(leaves, keys, strict=False)]
+    return jax.tree.unflatten(structure, changed)
+
+
+def _one_camera(image: jax.Array, key: jax.Array, shift: int, recolor: float) -> jax.Array:
+    shift_key, color_key = jax.random.split(key)
+    if shift:
+        padded = jnp.pad(image, ((0, 0), (shift, shift), (shift, shift), (0, 0)), mode="edge")
+        y, x = jax.random.randint(shift_key, (2,), 0, 2 * shift + 1)
+        image = jax.lax.dynamic_slice(padded, (0, y, x, 0), image.shape)
+    if recolor:
+        factor = jax.random.uniform(color_key, (3,), minval=1 - recolor, maxval=1 + recolor)
+        image = jnp.clip(jnp.round(image * factor), 0, 255).astype(jnp.uint8)
+    return image
