@@ -9,31 +9,80 @@ from rich.table import Table
 
 from milx.core.commands import command
 from milx.core.messages import printable
-from milx.data.dataset import DataSet, check_size
+from milx.data.dataset import LARGEST, DataSet, check_size
+from milx.data.header import Header
 from milx.methods.whitening import MIN_STD
 from milx.types import SPLITS, by_field
 
 MANY_ROWS = 256
 """Images with more rows than this are slow to learn from."""
+FEW_TASKS = 20
+"""With fewer training tasks, meta-learning has little to learn from."""
 _SPREAD = 3
 """Times that the longest demonstration is longer than the shortest, beyond which resampling distorts."""
 
 
 def problems(data: DataSet) -> list[str]:
     """Finds what will go wrong, a sentence each, the worst first; reads all states, all actions and first images."""
+    head = data.header
+    found = [*_refusals(data), *_disappointments(head)]
+    for field, values in vectors(data).items():
+        finite = values[np.isfinite(values).all(axis=1)]
+        for i in np.flatnonzero(finite.std(axis=0) < MIN_STD).tolist() if len(finite) else ():
+            found.append(f"{entry(head, field, i)} is constant: it says nothing")
+    for number, task in enumerate(head.tasks):
+        if head.image_shape is not None and task.lengths:
+            seen = data.read(number, 0, np.zeros(1, int), fields=("image",)).image
+            for name, image in by_field(seen).items():
+                if image.min() == image.max():
+                    found.append(f"task {task.name!r}: the first {name} is of one color")
+    return found
+
+
+def entry(head: Header, field: str, index: int) -> str:
+    """Names an entry of the state or of the action."""
+    names = getattr(head, f"{field}_names")
+    return f"{field}[{index}]" + (f" ({names[index]})" if names else "")
+
+
+def _refusals(data: DataSet) -> list[str]:
+    """Finds what training refuses."""
     found, head = [], data.header
     for split in SPLITS:
         if not head.of_split(split):
-            found.append(f"no {split} tasks")
-    for task in head.tasks:
+            found.append(f"no {split} tasks: training refuses this data set")
+        elif not any(len(head.tasks[i].lengths) > 1 and any(head.tasks[i].has_action) for i in head.of_split(split)):
+            found.append(f"no {split} task with two demonstrations, of which one shows actions: training refuses this")
+    for number, task in enumerate(head.tasks):
         if len(task.lengths) < 2:
             found.append(f"task {task.name!r} has {len(task.lengths)} demonstration: one more must be the query")
         elif not any(task.has_action):
             found.append(f"task {task.name!r} shows no actions: it cannot be learned from")
+        for demo in range(len(task.lengths)):
+            read = data.read(number, demo, fields=("state", "action"))
+            for field, values in (("state", read.state), ("action", read.action)):
+                if values is None or (np.abs(values) <= LARGEST).all():
+                    continue
+                step, i = np.argwhere(~(np.abs(values) <= LARGEST))[0].tolist()
+                where = f"demonstration {demo} of task {task.name!r}, time step {step}"
+                found.append(f"{entry(head, field, i)} is {values[step, i]} in {where}: training refuses this")
+    return found
+
+
+def _disappointments(head: Header) -> list[str]:
+    """Finds what training accepts and what is likely to disappoint."""
+    found = []
+    training = head.of_split("train")
+    if len(training) < FEW_TASKS:
+        found.append(f"{len(training)} training tasks: with fewer than about {FEW_TASKS}, new tasks are hardly learned")
+    names = {task.name for task in head.tasks}
+    if names and len(names) < FEW_TASKS and all(set(task.instructions) == {task.name} for task in head.tasks):
+        found.append("every task is one sentence: if goals or objects differ within it, say so with --task=tasks.json")
+    families = {task.family for task in head.tasks}
     for split in SPLITS[1:]:
-        families = {head.tasks[i].family for i in head.of_split(split)}
-        if len(families) == 1 and len({task.family for task in head.tasks}) > 1:
-            found.append(f"all {split} tasks are of the family {families.pop()!r}: they say nothing of the others")
+        held_out = {head.tasks[i].family for i in head.of_split(split)}
+        if len(held_out) == 1 and len(families) > 1:
+            found.append(f"all {split} tasks are of the family {held_out.pop()!r}: they say nothing of the others")
     lengths = [length for task in head.tasks for length in task.lengths]
     if lengths and max(lengths) > _SPREAD * min(lengths):
         found.append(f"lengths from {min(lengths)} to {max(lengths)} steps: all are resampled to recorded.horizon")
@@ -42,18 +91,6 @@ def problems(data: DataSet) -> list[str]:
     for name, size in by_field(head.image_shape).items():
         if size[0] > MANY_ROWS:
             found.append(f"{name} of {size[0]} x {size[1]}: import it with fewer rows (--height)")
-    for field, values in vectors(data).items():
-        bad = ~np.isfinite(values)
-        if bad.any():
-            found.append(f"{field}: {int(bad.sum())} values are not finite")
-        for i in np.flatnonzero(np.nanstd(np.where(bad, np.nan, values), axis=0) < MIN_STD):
-            found.append(f"{field}[{i}] is constant: it says nothing")
-    for number, task in enumerate(head.tasks):
-        if head.image_shape is not None and task.lengths:
-            seen = data.read(number, 0, np.zeros(1, int), fields=("image",)).image
-            for name, image in by_field(seen).items():
-                if image.min() == image.max():
-                    found.append(f"task {task.name!r}: the first {name} is of one color")
     return found
 
 
@@ -86,8 +123,8 @@ def describe(data: DataSet, console: Console) -> None:
     sizes = [f"{name} {size[0]} x {size[1]}" for name, size in by_field(head.image_shape).items()]
     image = ", ".join(sizes) or "no images"
     if lengths:
-        median = int(np.median(lengths))
-        console.print(f"{image}; {min(lengths)} to {max(lengths)} steps, half of them at most {median}")
+        median, rate = int(np.median(lengths)), "" if head.fps is None else f", {head.fps:g} a second"
+        console.print(f"{image}; {min(lengths)} to {max(lengths)} steps, half of them at most {median}{rate}")
     for split in SPLITS:
         names = [printable(head.tasks[i].name) for i in head.of_split(split)]
         console.print(
@@ -102,7 +139,7 @@ def describe(data: DataSet, console: Console) -> None:
         with np.errstate(invalid="ignore"):
             for i, column in enumerate(values.T):
                 shown = (np.nanmin(column), np.nanmean(column), np.nanmax(column), np.nanstd(column))
-                table.add_row(f"{field}[{i}]", *(f"{value:.4g}" for value in shown))
+                table.add_row(printable(entry(head, field, i)), *(f"{value:.4g}" for value in shown))
     console.print(table)
 
 

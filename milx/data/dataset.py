@@ -29,6 +29,8 @@ from milx.data.header import VERSION, Header, TaskInfo, parse_header, read_heade
 from milx.types import SPLITS, Demo, ImageShape, by_field, from_fields, is_image
 
 ALL_FIELDS = ("image", "state", "action")
+LARGEST = 1e12
+"""The largest state or action whose squares can be summed in float32."""
 _CHUNK_BYTES = 1 << 20
 _MAX_CHUNK_BYTES = 1 << 28
 _GROUP = {"zarr_format": 3, "node_type": "group"}

@@ -1,6 +1,8 @@
 """What importers share: which episodes make a task, which tasks make a split, and writing them down."""
 
+import fnmatch
 import pathlib
+import re
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple, Protocol
 
@@ -9,6 +11,7 @@ from absl import app, flags
 from rich.progress import track
 
 from milx.core.commands import command
+from milx.core.messages import warn
 from milx.data import cameras, splits
 from milx.data.dataset import Writer
 from milx.data.splits import PREFIX
@@ -21,6 +24,7 @@ class Episode(NamedTuple):
     """One demonstration of a source.
 
     Attributes:
+        name: what the source calls it, by number or by name.
         task: the name of its task.
         length: its time steps.
         has_action: whether it shows actions.
@@ -28,6 +32,7 @@ class Episode(NamedTuple):
         instruction: what the source says was to be done; "" for nothing.
     """
 
+    name: str
     task: str
     length: int
     has_action: bool
@@ -63,6 +68,10 @@ def define_flags(*, state: str, action: str, task: str) -> None:
     flags.DEFINE_string("state", state, parts)
     flags.DEFINE_string("action", action, "Where the actions are; empty for none.")
     flags.DEFINE_string("task", task, "What makes a task: see above.")
+    some = "Episodes to import, separated by commas: names, numbers, 0-99, or patterns like 'lift/*'; all if empty."
+    flags.DEFINE_string("episodes", "", some)
+    bad = "Leave out episodes that cannot be read or hold numbers that are not finite, and report them."
+    flags.DEFINE_bool("skip_bad", False, bad)
     define_split_flags()
 
 
@@ -93,11 +102,64 @@ def run(argv: list[str], open_source: Callable[[str, Any], Source]) -> None:
         raise app.UsageError("expected two arguments, PATH and OUT")
     with command():
         source = open_source(argv[1], FLAGS)
-        episodes = source.episodes(FLAGS.task)
+        episodes = selected(source.episodes(FLAGS.task), FLAGS.episodes)
+        if FLAGS.skip_bad:
+            episodes = readable(episodes)
         families = splits.families_of({episode.task for episode in episodes}, FLAGS.family)
         chosen = None if FLAGS.splits is None else splits.read_patterns(FLAGS.splits)
         write(argv[2], episodes, source.contents, (FLAGS.validation, FLAGS.test), argv[1], families, chosen)
         print(f"{argv[2]}: look at it with `python -m milx.data.check {argv[2]}`")
+
+
+def selected(episodes: Iterable[Episode], wanted: str) -> list[Episode]:
+    """Selects episodes by names, ranges of numbers, or patterns, separated by commas; all if nothing is wanted.
+
+    Raises:
+        ValueError: for one of these that fits no episode.
+    """
+    patterns, found = [pattern for pattern in wanted.split(",") if pattern], list(episodes)
+    for pattern in patterns:
+        if not any(_fits(episode.name, pattern) for episode in found):
+            names = ", ".join(episode.name for episode in found[:5])
+            raise ValueError(f"episodes: got {pattern!r}, which fits none, expected names such as {names}")
+    return [each for each in found if not patterns or any(_fits(each.name, pattern) for pattern in patterns)]
+
+
+def _fits(name: str, pattern: str) -> bool:
+    numbers = re.fullmatch(r"(\d+)-(\d+)", pattern)
+    if numbers and name.isdecimal():
+        return int(numbers[1]) <= int(name) <= int(numbers[2])
+    return fnmatch.fnmatchcase(name, pattern)
+
+
+def readable(episodes: Iterable[Episode]) -> list[Episode]:
+    """Reads all episodes, and leaves out and reports those that cannot be read or hold numbers that are not finite."""
+    kept = []
+    for episode in track(list(episodes), "reading episodes"):
+        try:
+            checked(episode)
+        except ValueError as error:
+            warn(f"episode {episode.name} is left out: {error}")
+            continue
+        kept.append(episode)
+    return kept
+
+
+def checked(episode: Episode) -> Demo:
+    """Reads an episode.
+
+    Raises:
+        ValueError: if it cannot be read, or a number is not finite; the message names the episode and the time step.
+    """
+    demo = episode.read()
+    for field in ("state", "action"):
+        value = getattr(demo, field)
+        if value is None or np.isfinite(value).all():
+            continue
+        step, entry = np.argwhere(~np.isfinite(value))[0].tolist()
+        got = f"got {value[step, entry]} at time step {step}"
+        raise ValueError(f"{field}[{entry}] of episode {episode.name}: {got}, expected finite numbers (--skip_bad)")
+    return demo
 
 
 def write(
@@ -138,7 +200,7 @@ def write(
 
 
 def _as_written(episode: Episode, contents: Contents) -> Demo:
-    demo = episode.read()
+    demo = checked(episode)
     action = None if demo.action is None else np.asarray(demo.action, np.float32)
     state = np.asarray(demo.state, np.float32) if contents.state_size else None
     return Demo(cameras.fitted(demo.image, contents.image_shape), state, action)

@@ -12,6 +12,7 @@ import functools
 import io
 import pathlib
 import re
+import shlex
 from collections.abc import Iterator
 from typing import Any
 
@@ -75,7 +76,9 @@ class LeRobot:
             else:
                 name = file.relative_to(self.root).as_posix() if task == "file" else str(row["tasks"][0])
             read = functools.partial(self._read, row, file)
-            found.append(Episode(name, row["length"], bool(self.vectors["action"]), read, str(row["tasks"][0])))
+            found.append(
+                Episode(str(number), name, row["length"], bool(self.vectors["action"]), read, str(row["tasks"][0]))
+            )
         return found
 
     def _read(self, row: dict[str, Any], file: pathlib.Path) -> Demo:
@@ -165,7 +168,10 @@ class LeRobot:
         except (KeyError, TypeError, ValueError, RecursionError) as error:
             raise ValueError(f"{path}: expected LeRobot's metadata: {error!r}") from error
         if version.startswith("v2"):
-            raise ValueError(f"{path}: codebase_version: got {version}, expected v3.0; convert it with `{_CONVERTER}`")
+            folder = self.root.resolve()
+            where = f"--repo-id={shlex.quote(folder.name)} --root={shlex.quote(str(folder.parent))} --push-to-hub=false"
+            command = f"{_CONVERTER} {where}"
+            raise ValueError(f"{path}: codebase_version: got {version}, expected v3.0; convert it with `{command}`")
         if not version.startswith("v3"):
             raise ValueError(f"{path}: codebase_version: got {version}, expected v3.0")
         if not isinstance(features, dict) or not isinstance(fps, int | float) or not 0 < fps < 10_000:

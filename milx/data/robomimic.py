@@ -73,7 +73,9 @@ class Robomimic:
                     name = f"{path.stem}/{demo}"
                     own = path.stem if mapping is None else lookup(mapping, name, task, "task")
                     length = self._length(file, demo)
-                    found.append(Episode(own, length, bool(self.action), functools.partial(self._read, path, demo)))
+                    found.append(
+                        Episode(name, own, length, bool(self.action), functools.partial(self._read, path, demo))
+                    )
         return found
 
     def _names(self, demo: str) -> dict[str, int]:

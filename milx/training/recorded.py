@@ -21,7 +21,7 @@ from milx.config.check import check_config
 from milx.config.schema import GIVEN, Config, ConvConfig
 from milx.core import files
 from milx.data import RECORDED
-from milx.data.dataset import DataSet
+from milx.data.dataset import LARGEST, DataSet
 from milx.data.goals import with_goals
 from milx.data.recorded import MOST_DEMOS, Recorded, Shards, read_demos, read_later, sample_batch
 from milx.deploy.policy import Policy, read_spec
@@ -56,10 +56,6 @@ def spec_of(data: DataSet, config: Config) -> Spec:
     """Returns the sizes of what a policy sees and does on a data set."""
     head = data.header
     return Spec(head.image_shape, head.state_size, head.action_size, None, tuple(config.recorded.goal_indices))
-
-
-LARGEST = 1e12
-"""The largest state or action whose squares can be summed in float32."""
 
 
 MIN_ERROR = 1e-9

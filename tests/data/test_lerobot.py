@@ -1,8 +1,10 @@
 """LeRobot's data sets: one that the real writer wrote, and damaged or hostile copies of it."""
 
+import dataclasses
 import io
 import json
 import pathlib
+import shlex
 import shutil
 import sys
 
@@ -88,8 +90,8 @@ def test_an_import_is_a_data_set(tmp_path):
             halved = image.reshape(len(image), 24, 2, 32, 2, 3).mean(axis=(2, 4))
             assert np.abs(demo.image - halved)[:, :, [3, -3]].max() < 7
     problems = " ".join(check.problems(data))
-    assert "state[3] is constant" in problems
-    assert "action[2] is constant" in problems
+    assert "state[3] (d) is constant" in problems
+    assert "action[2] (grip) is constant" in problems
     assert "first image is of one color" in problems, "that of the first episode"
 
 
@@ -115,6 +117,22 @@ def test_files_or_a_mapping_make_tasks(tmp_path):
     path.write_text(json.dumps({"0": "even"}))
     with pytest.raises(ValueError, match="does not say where '1' belongs"):
         open_set().episodes(str(path))
+
+
+def test_some_episodes_are_selected_and_bad_ones_left_out(copy, capsys):
+    found = open_set(copy).episodes("task_index")
+    names = lambda wanted: [episode.name for episode in episodes.selected(found, wanted)]  # noqa: E731
+    assert names("") == [str(i) for i in range(9)]
+    assert names("1-3,7") == ["1", "2", "3", "7"]
+    with pytest.raises(ValueError, match="episodes: got '9', which fits none, expected names such as 0, 1"):
+        names("9")
+    broken = dataclasses.replace(found[1].read(), action=np.array([[0.0, 1.0, 2.0], [0.0, np.inf, 2.0]]))
+    found[1] = found[1]._replace(read=lambda: broken)
+    with pytest.raises(ValueError, match=r"action\[1\] of episode 1: got inf at time step 1, expected finite numbers"):
+        episodes.write(copy / "out", found, open_set(copy).contents, (0.3, 0.3), "there")
+    assert not (copy / "out").exists()
+    assert [episode.name for episode in episodes.readable(found)] == ["0", *map(str, range(2, 9))]
+    assert "episode 1 is left out: action[1] of episode 1: got inf" in " ".join(capsys.readouterr().err.split())
 
 
 def test_states_and_actions_may_lack():
@@ -155,11 +173,15 @@ def test_a_value_that_is_stored_once_and_meant_often_is_refused(copy, monkeypatc
 
 
 def test_older_versions_name_the_converter(copy):
+    """Reads the command as a shell would: the converter looks for ROOT/REPO_ID."""
     change_info(copy, codebase_version="v2.1")
-    with pytest.raises(
-        ValueError, match=r"codebase_version: got v2.1, expected v3.0; convert it with `python -m lerobot"
-    ):
+    with pytest.raises(ValueError, match=r"codebase_version: got v2.1, expected v3.0; convert it with `") as error:
         open_set(copy)
+    words = shlex.split(str(error.value).split("`")[1])
+    assert words[:3] == ["python", "-m", "lerobot.datasets.v30.convert_dataset_v21_to_v30"]
+    given = dict(word.removeprefix("--").split("=") for word in words[3:])
+    assert pathlib.Path(given["root"]) / given["repo-id"] == copy.resolve()
+    assert given["push-to-hub"] == "false"
     change_info(copy, codebase_version="v4.0")
     with pytest.raises(ValueError, match=r"codebase_version: got v4\.0, expected v3\.0"):
         open_set(copy)

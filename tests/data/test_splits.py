@@ -65,7 +65,8 @@ def test_splits_can_be_chosen_by_patterns():
 
 def test_an_import_keeps_families_and_chosen_splits(tmp_path):
     demo = Demo(state=np.zeros((5, 2), np.float32), action=np.ones((5, 2), np.float32))
-    found = [Episode(name, 5, True, lambda: demo) for name in ("door/1", "door/2", "tap/1", "tap/2") for _ in range(2)]
+    tasks = ("door/1", "door/2", "tap/1", "tap/2")
+    found = [Episode("", name, 5, True, lambda: demo) for name in tasks for _ in range(2)]
     names = {episode.task for episode in found}
     (tmp_path / "families.json").write_text(json.dumps({name: name[:2] for name in names}))
     (tmp_path / "splits.json").write_text(json.dumps({"validation": ["tap/1"], "test": ["door/2"]}))
