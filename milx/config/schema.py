@@ -194,6 +194,8 @@ class TrainConfig:
     """The meta-training loop.
 
     Attributes:
+        init: a run's folder, or the name of a policy that ships with milx: training starts from its parameters, as far
+            as names and sizes are the same. None to draw all of them.
         steps: number of meta-updates.
         meta_batch: tasks in a meta-batch.
         shots: support demonstrations of each task.
@@ -207,6 +209,7 @@ class TrainConfig:
         eval_every: meta-updates between two validations, each with a checkpoint.
     """
 
+    init: str | None = None
     steps: int = 30_000
     meta_batch: int = 5
     shots: int = 1

@@ -20,6 +20,24 @@ def leaves(tree: Any) -> dict[str, Any]:
     return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in pairs}
 
 
+def overlaid(tree: Any, other: Any) -> tuple[Any, list[str]]:
+    """Replaces the arrays of a tree by those of another one that have the same names and shapes, in the tree's types.
+
+    Returns:
+        The new tree, and the names of what is replaced.
+    """
+    theirs, replaced = leaves(other), []
+
+    def replace(path: tuple, leaf: Any) -> Any:
+        name = jax.tree_util.keystr(path, simple=True, separator=".")
+        if name not in theirs or theirs[name].shape != leaf.shape:
+            return leaf
+        replaced.append(name)
+        return jax.numpy.asarray(theirs[name], leaf.dtype)
+
+    return jax.tree_util.tree_map_with_path(replace, tree), replaced
+
+
 def fingerprint(tree: Any) -> str:
     """Computes the SHA-256 hash of the names, types, shapes and contents of all arrays."""
     digest = hashlib.sha256()

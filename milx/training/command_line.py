@@ -21,12 +21,12 @@ from milx.methods import METHODS
 from milx.training import recorded
 
 FLAGS = flags.FLAGS
-_OWN_FLAGS = {"env_name": "env", "method_name": "method", "preset": "preset", "seed": "seed"}
+_OWN_FLAGS = {"env_name": "env", "method_name": "method", "preset": "preset", "seed": "seed", "train.init": "init"}
 flags.disclaim_key_flags()  # so that --help of a launcher lists the flags defined here
 
 
 def define_flags(values: flags.FlagValues = FLAGS) -> None:
-    """Defines --env, --method, --preset, --seed, --workdir and what several hosts need."""
+    """Defines --env, --method, --preset, --init, --seed, --workdir and what several hosts need."""
     string, integer = (
         functools.partial(define, flag_values=values) for define in (flags.DEFINE_string, flags.DEFINE_integer)
     )
@@ -40,6 +40,7 @@ def define_flags(values: flags.FlagValues = FLAGS) -> None:
         "(smaller images and networks; the default without an accelerator). --config.path.to.field=value changes any "
         "of them.",
     )
+    string("init", None, "A run's folder, or a policy that ships with milx, whose parameters training starts from.")
     integer("seed", 0, "Seed of training tasks, initial parameters and batches.", lower_bound=0)
     string("coordinator", None, "Several hosts outside SLURM and Cloud TPU: address:port of the first one.")
     integer("num_processes", None, "With --coordinator: how many hosts there are.", lower_bound=1)
@@ -118,6 +119,7 @@ def parse(argv: Sequence[str], values: flags.FlagValues = FLAGS) -> list[str]:
             config = recorded.config_for(values.data, values.method, preset, values.seed)
     except (ValueError, OSError) as error:
         raise flags.Error(str(error)) from error
+    config.train.init = values.init
     _check_fields(argv, config)
     unset = [arg for arg in argv if arg.startswith("--config.") and arg.endswith("=None")]
     for arg in unset:  # ml_collections has no way to say None

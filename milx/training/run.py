@@ -27,6 +27,7 @@ from milx.config.schema import Config, ConvConfig
 from milx.core import files, parallel, progress, signals
 from milx.core.checkpoint import UNVALIDATED, Checkpoints
 from milx.core.messages import printable, say
+from milx.deploy.pretrained import load
 from milx.evaluation import listening, results
 from milx.methods import params_like
 from milx.networks import fixed_filters
@@ -138,6 +139,8 @@ class Run(abc.ABC):
                 return
             if isinstance(network, ConvConfig) and network.fixed_filters not in (None, fixed_filters.KMEANS):
                 fixed_filters.read_filters(network.fixed_filters, network)  # refuses a bad file before planning
+            if config.init is not None:
+                load(config.init)  # refuses what is not there before planning
             params = self._params_like
             others = self._precompile(params)
             compiled = compile_in_background(self.trainer, params, self._shapes(), config.log_every, others)

@@ -8,12 +8,16 @@ import jax
 import numpy as np
 
 from milx.config.schema import Config, ConvConfig
+from milx.core import pytrees
 from milx.core.checkpoint import UNVALIDATED, Checkpoints
 from milx.core.files import FileError
+from milx.core.messages import say
+from milx.deploy.pretrained import load
 from milx.evaluation import provenance
 from milx.methods.whitening import Whitening
 from milx.networks import fixed_filters
 from milx.training.update import Trainer, TrainState
+from milx.types import Params
 
 PARTS = ("demos", "compile", "train", "evaluate", "total")
 """The parts of a run whose seconds are counted."""
@@ -47,6 +51,8 @@ def initial_state(trainer: Trainer, config: Config, training: Training) -> tuple
     """Makes the state before the first meta-update on these demonstrations, and the key of the batches."""
     init_key, batch_key = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), 3))
     state = trainer.init(init_key, training.whitening)
+    if config.train.init is not None:
+        state = dataclasses.replace(state, params=start_from(config.train.init, state.params))
     network = config.network
     if not isinstance(network, ConvConfig) or network.fixed_filters is None:
         return state, batch_key
@@ -55,6 +61,28 @@ def initial_state(trainer: Trainer, config: Config, training: Training) -> tuple
     else:
         filters = fixed_filters.read_filters(network.fixed_filters, network)
     return dataclasses.replace(state, params=fixed_filters.put(state.params, filters)), batch_key
+
+
+def start_from(run: str, params: Params) -> Params:
+    """Replaces parameters by those of a trained policy that have the same names and sizes; the whitening stays.
+
+    Args:
+        run: as `milx.load` takes it.
+        params: what a method has drawn.
+
+    Raises:
+        ValueError: if there is no such policy, or it has nothing in common with these parameters.
+    """
+    theirs = {name: part for name, part in load(run).params.items() if name != "whitening"}
+    started, names = pytrees.overlaid(params, theirs)
+    learned = [name for name in pytrees.leaves(params) if not name.startswith("whitening")]
+    if not names:
+        expected = "a policy with parameters of the same names and sizes: the same method and a similar network"
+        raise ValueError(
+            f"init: got {run!r}, which has none of the {len(learned)} parameters here, expected {expected}"
+        )
+    say(f"{len(names)} of {len(learned)} parameters start from {run}; all others are drawn")
+    return started
 
 
 def save_state(

@@ -17,18 +17,21 @@ from rich.console import Console
 from tiny import QUIET
 
 import milx
+from milx import methods
 from milx.config import assemble
-from milx.core import signals
+from milx.core import pytrees, signals
 from milx.core.checkpoint import UNVALIDATED, Checkpoints
 from milx.data.dataset import DataSet, Writer
 from milx.deploy import standalone
 from milx.deploy.policy import read_spec
 from milx.export import export
 from milx.methods.mil import MIL
+from milx.methods.whitening import Whitening
 from milx.training import recorded
 from milx.training.factory import make_run
 from milx.training.metrics import MetricsWriter, read_metrics
 from milx.training.recorded import RecordedRun
+from milx.training.state import start_from
 from milx.types import Demo
 
 HORIZON = 8
@@ -94,6 +97,28 @@ def test_held_out_tasks_are_learned_from_their_demonstration(finished):
 def read_resampled(data, task):
     steps = [np.linspace(0, length - 1, HORIZON).round().astype(int) for length in data.header.tasks[task].lengths]
     return [data.read(task, i, index) for i, index in enumerate(steps)]
+
+
+def test_a_run_starts_from_the_parameters_of_another_as_far_as_they_fit(finished, folder):
+    """Starts a policy with one more layer: its own last layers have other sizes, and the whitening is its own."""
+    run, config = finished[0], tiny_config(folder)
+    config.network.fc_layers = (40, 40, 30)
+    method = methods.make(config, run.spec)
+    ones = Whitening(np.zeros(3), np.ones(3), np.zeros(2), np.ones(2))
+    drawn, theirs = method.init(jax.random.key(5), ones), milx.load(run.folder).params
+    started = pytrees.leaves(start_from(str(run.folder), drawn))
+    for name, value in pytrees.leaves(drawn).items():
+        other = pytrees.leaves(theirs).get(name)
+        fits = other is not None and other.shape == value.shape and not name.startswith("whitening")
+        np.testing.assert_array_equal(started[name], other if fits else value)
+    kernel = "policy.controller.Dense_{}.kernel"
+    assert (started[kernel.format(1)] != pytrees.leaves(drawn)[kernel.format(1)]).all()
+    assert (started[kernel.format(2)] == pytrees.leaves(drawn)[kernel.format(2)]).all()
+    with pytest.raises(ValueError, match=r"init: got .* which has none of the 1 parameters here"):
+        start_from(str(run.folder), {"other": np.zeros(3)})
+    config.train.init = "nowhere"
+    with pytest.raises(ValueError, match="run: got 'nowhere', expected the folder of a run, or one of"):
+        make_run(config, run.folder.parent / "init", QUIET).train()
 
 
 @pytest.mark.slow
