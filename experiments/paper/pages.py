@@ -59,10 +59,10 @@ def _paper_table(which: tables.Table) -> str:
     return tables.markdown(which, list(which.rows), cells.read(RESULTS / which.folder)).split("\n\n")[0]
 
 
-def _published(beginning: str) -> str:
-    """Writes the rows of the method as published whose names begin so."""
-    rows = {name: row for name, row in published.TABLES["results"].items() if name.startswith(beginning)}
-    return published.markdown(rows, cells.read(RESULTS / "paper_results"))
+def _published(beginning: str, name: str = "results") -> str:
+    """Writes the rows of a table of the method as published whose names begin so."""
+    rows = {row: changes for row, changes in published.TABLES[name].items() if row.startswith(beginning)}
+    return published.markdown(rows, cells.read(RESULTS / f"paper_{name}"))
 
 
 TABLES: dict[str, Callable[[], str]] = {
@@ -74,6 +74,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "table2": lambda: _paper_table(table2.TABLE),
     "table3": lambda: _paper_table(table3.TABLE),
     "published": lambda: _published(""),
+    "published-small": lambda: _published("", "small"),
     "published-reach": lambda: _published("reach"),
     "published-push": lambda: _published("push"),
     "figure3": lambda: figure3.markdown(list(cells.read(RESULTS / "figure3").values())),
