@@ -179,9 +179,7 @@ def _write_meta(
     import pyarrow
 
     head = data.header
-    tasks = pyarrow.table({"task_index": range(len(said)), "__index_level_0__": said})
-    pandas = {"index_columns": ["__index_level_0__"], "column_indexes": [], "columns": [], "pandas_version": "2.0.0"}
-    _write_table(folder / "tasks.parquet", [tasks.replace_schema_metadata({"pandas": json.dumps(pandas)})])
+    _write_table(folder / "tasks.parquet", [_tasks(said)])
     _write_table(folder / "episodes" / "chunk-000" / "file-000.parquet", [pyarrow.Table.from_pylist(rows)])
     features = dict(_described(data))
     files.write_json(folder / "stats.json", {name: _joined(rows, name) for name in features})
@@ -197,6 +195,18 @@ def _write_meta(
     info |= {"data_files_size_in_mb": _FILE_BYTES >> 20, "video_files_size_in_mb": 200, "fps": fps, "splits": splits}
     info |= {"data_path": _DATA_PATH, "video_path": None, "features": features}
     files.write_json(folder / "info.json", info)
+
+
+def _tasks(said: list[str]) -> Any:
+    """Makes the table of tasks, whose index pandas takes from the metadata."""
+    import pyarrow
+
+    index, keys = "__index_level_0__", ("name", "field_name", "pandas_type", "numpy_type")
+    kinds = ("task_index", "task_index", "int64", "int64"), (None, index, "unicode", "str")
+    columns = [dict(zip(keys, kind, strict=True)) | {"metadata": None} for kind in kinds]
+    known = {"index_columns": [index], "column_indexes": [], "columns": columns, "pandas_version": "2.0.0"}
+    table = pyarrow.table({"task_index": range(len(said)), index: said})
+    return table.replace_schema_metadata({"pandas": json.dumps(known)})
 
 
 def _described(data: DataSet) -> Iterator[tuple[str, dict[str, Any]]]:
