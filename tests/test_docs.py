@@ -1,14 +1,20 @@
 """The how-tos are true: their Python blocks run from top to bottom, and their commands exist."""
 
+import contextlib
 import importlib
+import json
 import pathlib
 import re
+import shlex
+import subprocess
+import sys
 
 import pytest
 
 from milx.config import registry
 
 DOCS = pathlib.Path(__file__).parents[1] / "docs"
+FIXTURES = pathlib.Path(__file__).parent / "fixtures"
 
 
 PAGES = sorted(DOCS.rglob("*.md"))
@@ -39,9 +45,42 @@ def registries():
 def test_the_blocks_of_a_how_to_run(path, tmp_path, monkeypatch, cache, registries):
     monkeypatch.chdir(tmp_path)
     scope = {"__name__": "__main__"}
-    code = blocks(path, "python")
-    for block in code:
-        exec(compile(block, path.name, "exec"), scope)
+    for block in blocks(path, "python"):
+        if file := re.match(r"# (\w+\.py)\n", block):
+            (tmp_path / file[1]).write_text(block)
+        else:
+            exec(compile(block, path.name, "exec"), scope)
+
+
+@pytest.mark.slow
+def test_the_commands_for_demonstrations_of_ones_own_run(tmp_path, cache):
+    """Runs them one after the other, with shorter training, on LeRobot's and robomimic's files of the tests."""
+    page = DOCS / "how_to" / "your_own_demonstrations.md"
+    (world,) = (block for block in blocks(page, "python") if block.startswith("# my_world.py"))
+    (tmp_path / "my_world.py").write_text(world)
+    scope = {"__name__": "__main__"}
+    (writes,) = (block for block in blocks(page, "python") if "with Writer(" in block)
+    with contextlib.chdir(tmp_path):
+        exec(compile(writes, page.name, "exec"), scope)
+    tasks = {f"lift/demo_{i}": f"lift {i}" for i in (0, 1, 2, 10)}
+    (tmp_path / "tasks.json").write_text(json.dumps(tasks))
+    given = {"~/datasets/my_arm": FIXTURES / "lerobot", "~/datasets/lift.hdf5": FIXTURES / "robomimic" / "lift.hdf5"}
+    ran = 0
+    for line in "".join(blocks(page, "bash")).splitlines():
+        words = [str(given.get(word, word)) for word in shlex.split(line)]
+        if words[0] == "pip":
+            continue
+        if "milx.train" in words:
+            words += ["--preset=cpu", "--config.train.steps=100", "--config.train.eval_every=100"]
+        if "milx.evaluate" in words:
+            words += ["--episodes=1", "--workers=2"]
+        done = subprocess.run([sys.executable, *words[1:]], cwd=tmp_path, capture_output=True, text=True)
+        assert done.returncode == 0, f"{line}\n{done.stdout[-2000:]}{done.stderr[-2000:]}"
+        ran += 1
+    assert ran == 9
+    found = json.loads((tmp_path / "runs" / "demos" / "gym.json").read_text())["controls"]
+    assert found["replay"]["ever"] > found["random"]["ever"]
+    assert (tmp_path / "exported_chunks" / "policy.py").is_file()
 
 
 @pytest.mark.parametrize("path", [*PAGES, *sorted(DOCS.parent.glob("*.md"))], ids=lambda path: path.stem)
