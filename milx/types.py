@@ -103,6 +103,9 @@ class Spec:
             if the state contains them.
         height_index: index of the entry of the state that holds the height of the hand, in environments where the hand
             must come down to an object; None otherwise.
+        fps: time steps in a second of recorded demonstrations; None if it is not known.
+        state_names: of the entries of the state; empty if they have none.
+        action_names: of the entries of the action, likewise.
     """
 
     image_shape: ImageShape
@@ -113,6 +116,9 @@ class Spec:
     image_to_goal: tuple[tuple[float, ...], ...] | None = None
     object_indices: tuple[tuple[int, ...], ...] = ()
     height_index: int | None = None
+    fps: float | None = None
+    state_names: tuple[str, ...] = ()
+    action_names: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Returns the fields as a dictionary that can be written as JSON, with the version of their layout."""
@@ -148,6 +154,9 @@ class Spec:
             "goal_indices": _is_table(spec.goal_indices, (goal,), 0, size),
             "image_to_goal": spec.image_to_goal is None or _is_table(spec.image_to_goal, (3, goal)),
             "object_indices": _is_table(spec.object_indices, (objects, 2), 0, size),
+            "fps": spec.fps is None or _is_table((spec.fps,), (1,)),
+            "state_names": _are_texts(spec.state_names, size),
+            "action_names": _are_texts(spec.action_names, actions),
             "height_index": spec.height_index is None or _is_table((spec.height_index,), (1,), 0, size),
         }
         for name in (name for name, value in good.items() if not value):
@@ -196,6 +205,11 @@ def _as_tuple(value: Any) -> Any:
     if isinstance(value, dict):
         return {name: _as_tuple(each) for name, each in value.items()}
     return tuple(_as_tuple(each) for each in value) if isinstance(value, list) else value
+
+
+def _are_texts(value: Any, count: int) -> bool:
+    """Tells whether a value is a tuple of so many texts, or of none."""
+    return isinstance(value, tuple) and len(value) in (0, count) and all(isinstance(text, str) for text in value)
 
 
 def _is_table(value: Any, shape: tuple[int, ...], low: int | None = None, high: int = 0) -> bool:

@@ -74,6 +74,7 @@ def export(policy: Policy, out: str | pathlib.Path, shots: int = 1) -> None:
     arrays = {f"{i:04d}": np.asarray(leaf) for i, leaf in enumerate(leaves)}
     arrays |= {f"memory{i:04d}": np.asarray(leaf) for i, leaf in enumerate(memory)}
     header = {"format": standalone.FORMAT, "inputs": sizes, "chunk": policy.config.method.chunk}
+    header["metadata"] = {name: getattr(policy.spec, name) for name in ("fps", "state_names", "action_names")}
     with files.creating(folder) as partial:
         for name, program in programs.items():
             files.write_bytes(partial / f"{name}.bin", program)

@@ -15,6 +15,7 @@ from milx.config.schema import GIVEN, Config
 from milx.core import files
 from milx.core.checkpoint import Checkpoints
 from milx.core.files import FileError
+from milx.data.cameras import fitted
 from milx.data.dataset import spread
 from milx.data.frames import in_chunks
 from milx.data.goals import with_goals
@@ -50,8 +51,9 @@ class Policy:
 
         Args:
             params: `policy.params`.
-            demo: images [..., T, H, W, 3] uint8 (of several cameras a dictionary by name; None for a policy that sees
-                no pixels), states [..., T, S] and actions [..., T, A], as NumPy or JAX arrays.
+            demo: images [..., T, H, W, 3] uint8, states [..., T, S] and actions [..., T, A], as NumPy or JAX arrays. Of
+                several cameras, images are a dictionary by name; None for a policy that sees no pixels. NumPy images
+                that are larger, with the same proportions, are shrunk as importers do.
 
         Returns:
             The parameters adapted to the task (`task_params`), for `act` and `step`.
@@ -258,7 +260,7 @@ def _as_array(field: str, value: Any) -> Any:
 
 def _check_image(what: str, value: Any, lead: tuple[int, ...], spec: Spec) -> Any:
     """Checks the images of all cameras; `what` shows them."""
-    wanted = by_field(spec.image_shape)
+    wanted, value = by_field(spec.image_shape), fitted(value, spec.image_shape) if spec.image_shape else value
     if not wanted:
         if value is not None:
             raise ValueError(f"{what}.image: got {type(value).__name__}, expected None: this policy sees no pixels")

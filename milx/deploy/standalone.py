@@ -31,6 +31,7 @@ class Policy:
 
     Attributes:
         sizes: the shapes of the inputs, by field: [K, T, ...] for "adapt" and [...] for "act".
+        metadata: "fps", "state_names" and "action_names" of the demonstrations, as far as they are known.
         chunk: the number of time steps whose actions "adapt" takes side by side, and the policy predicts at once.
         params: the learned parameters.
         initial_memory: the memory at the start of an episode; empty for most policies.
@@ -41,7 +42,9 @@ class Policy:
 
     def __init__(self, folder: str | os.PathLike):
         folder = pathlib.Path(folder)
-        self.sizes, digests, self.chunk = _read_header(folder / "policy.json")
+        header = _read_header(folder / "policy.json")
+        self.sizes, digests, self.chunk = (header[name] for name in ("inputs", "sha256", "chunk"))
+        self.metadata = header.get("metadata", {})
         names = ("params.npz", "adapt.bin", "act.bin")
         params, *programs = (_read(folder / name, digests.get(name)) for name in names)
         with np.load(io.BytesIO(params), allow_pickle=False) as arrays:
@@ -93,7 +96,8 @@ class Policy:
         Args:
             task_params: the parameters that `adapt` returned.
             **observation: "image" uint8 [H, W, 3], of several cameras a dictionary by name, and "state" [S]; exactly
-                those that `sizes["act"]` lists.
+                those that `sizes["act"]` lists. Larger images of the same proportions are shrunk as they were when the
+                demonstrations were imported.
 
         Raises:
             ValueError: for a field that is missing, not expected, or has a wrong shape or type, or a value that is not
@@ -136,6 +140,8 @@ class Policy:
         checked = {}
         for name, value in values.items():
             value, shape = np.asarray(value), tuple(wanted[name])
+            if name.partition(".")[0] == "image":
+                value = _fitted(value, shape[-3:-1])
             entries = value.shape[value.ndim - len(shape) + lead :]
             if entries != shape[lead:] or value.ndim not in (len(shape), len(shape) - bool(lead)) or 0 in value.shape:
                 raise ValueError(f"{name}: got shape {list(value.shape)}, expected [..., {str(list(shape[lead:]))[1:]}")
@@ -148,6 +154,36 @@ class Policy:
         return checked
 
 
+def _fitted(images: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Shrinks images [..., H, W, 3] uint8 to this (H, W) if they have its proportions and are larger."""
+    if images.dtype != np.uint8 or images.ndim < 3 or 0 in images.shape or images.shape[-3] <= shape[0]:
+        return images
+    scale = shape[0] / images.shape[-3]
+    if max(1, round(scale * images.shape[-2])) != shape[1]:
+        return images
+    rows, columns = (_areas(images.shape[axis], size) for axis, size in ((-3, shape[0]), (-2, shape[1])))
+    narrow = _rounded(np.einsum("wx,...yxc->...ywc", columns, images.astype(float), optimize=True))
+    return _rounded(np.einsum("hy,...ywc->...hwc", rows, narrow, optimize=True)).astype(np.uint8)
+
+
+def _areas(size: int, smaller: int) -> np.ndarray:
+    """Returns the weights [smaller, size] of means over areas, as Pillow's box filter has them, times 2^22.
+
+    Pillow may take the columns before the rows, which changes some pixels by one level.
+    """
+    scale = size / smaller
+    center = (np.arange(smaller)[:, None] + 0.5) * scale
+    pixel = np.arange(size)
+    inside = (pixel >= np.floor(center - 0.5 * scale + 0.5)) & (pixel < np.floor(center + 0.5 * scale + 0.5))
+    offset = (pixel - center + 0.5) / scale
+    weight = inside & (offset > -0.5) & (offset <= 0.5)
+    return np.floor(0.5 + 2.0**22 * weight / weight.sum(axis=1, keepdims=True))
+
+
+def _rounded(sums: np.ndarray) -> np.ndarray:
+    return np.clip(np.floor((sums + 2.0**21) / 2.0**22), 0, 255)
+
+
 def _check_inputs(path: pathlib.Path, name: str, fields: dict, takes: tuple, after: int) -> None:
     """Raises ValueError if the shapes of a program's fields are not those that it takes; `after` inputs follow them."""
     takes = takes[-len(fields) - after :]
@@ -156,8 +192,8 @@ def _check_inputs(path: pathlib.Path, name: str, fields: dict, takes: tuple, aft
         raise ValueError(f"{path}: {name}: got {fields}, expected {named}, which the program takes")
 
 
-def _read_header(path: pathlib.Path) -> tuple[dict, dict, int]:
-    """Reads the shapes of the inputs, the SHA-256 of the other files by name, and the length of a chunk."""
+def _read_header(path: pathlib.Path) -> dict:
+    """Reads the shapes of the inputs, the SHA-256 of the other files by name, the length of a chunk, and metadata."""
     try:
         values = json.loads(_content(path))
         if values["format"] != FORMAT:
@@ -170,7 +206,7 @@ def _read_header(path: pathlib.Path) -> tuple[dict, dict, int]:
         chunk = values.get("chunk", 1)
         if type(chunk) is not int or chunk < 1:
             raise ValueError(f"chunk: got {chunk!r:.100}, expected a whole number, at least 1")
-        return inputs, digests, chunk
+        return values | {"chunk": chunk}
     except (KeyError, TypeError, ValueError, RecursionError) as error:
         raise ValueError(f"{path}: expected what the export of a policy writes: {error!r:.200}") from error
 

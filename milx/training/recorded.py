@@ -55,7 +55,16 @@ def config_for(path: str | pathlib.Path, method: str = "mil", preset: str = "fas
 def spec_of(data: DataSet, config: Config) -> Spec:
     """Returns the sizes of what a policy sees and does on a data set."""
     head = data.header
-    return Spec(head.image_shape, head.state_size, head.action_size, None, tuple(config.recorded.goal_indices))
+    return Spec(
+        head.image_shape,
+        head.state_size,
+        head.action_size,
+        None,
+        tuple(config.recorded.goal_indices),
+        fps=head.fps,
+        state_names=head.state_names,
+        action_names=head.action_names,
+    )
 
 
 MIN_ERROR = 1e-9

@@ -9,6 +9,7 @@ import pytest
 from tiny import QUIET
 
 import milx
+from milx.data.cameras import resized, shrunk
 from milx.data.dataset import DataSet, Writer
 from milx.deploy import standalone
 from milx.export import export
@@ -117,6 +118,26 @@ def test_an_exported_policy_sees_both_cameras(policy, demos, tmp_path):
         np.testing.assert_allclose(alone.act(learned, image=seen, state=demo.state[t]), action, atol=1e-5)
     with pytest.raises(ValueError, match=r"fields: got \['image\.hand', 'state'\], expected .*image\.scene"):
         alone.act(learned, image={"hand": seen["hand"]}, state=demo.state[0])
+
+
+def test_images_of_the_cameras_own_size_are_shrunk_as_at_import(policy, demos, tmp_path):
+    """Compares an export with Pillow's filter, and with the policy; sizes of other proportions are refused."""
+    export(policy, tmp_path / "exported")
+    alone, demo = standalone.Policy(tmp_path / "exported"), demos[0][0]
+    large = {"scene": RNG.integers(0, 256, (31, 41, 3), np.uint8), "hand": RNG.integers(0, 256, (20, 20, 3), np.uint8)}
+    small = {name: next(resized([image], SIZES[name])) for name, image in large.items()}
+    for name, image in large.items():
+        assert shrunk(image.shape, SIZES[name][0]) == SIZES[name]
+        off = standalone._fitted(image, SIZES[name]).astype(int) - small[name]
+        assert np.abs(off).max() <= 1
+    learned = alone.adapt(image=demo.image, state=demo.state, action=demo.action)
+    expected = policy.adapt(policy.params, demo)
+    action = policy.act(expected, Observation(large, demo.state[0]))
+    np.testing.assert_array_equal(action, policy.act(expected, Observation(small, demo.state[0])))
+    np.testing.assert_allclose(alone.act(learned, image=large, state=demo.state[0]), action, atol=0.02)
+    with pytest.raises(ValueError, match=r"image.hand: got shape \[20, 30, 3\]"):
+        alone.act(learned, image={**small, "hand": np.zeros((20, 30, 3), np.uint8)}, state=demo.state[0])
+    assert alone.metadata == {"fps": 20, "state_names": ["x", "y", "z"], "action_names": ["dx", "dy"]}
 
 
 def test_cameras_that_lack_or_do_not_fit_are_named(policy, demos):
