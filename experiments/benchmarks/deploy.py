@@ -114,7 +114,7 @@ def measure_import(folder: pathlib.Path, report: common.Report) -> None:
         write_lerobot(root, codec)
         began = time.perf_counter()
         source = LeRobot(root, None, "observation.state", "action", SIZE)
-        episodes.write(out, source.episodes("task_index"), source.sizes, (0.1, 0.1), "benchmark")
+        episodes.write(out, source.episodes("task_index"), source.contents, (0.1, 0.1), "benchmark")
         rate = TASKS * EPISODES * FRAMES / (time.perf_counter() - began)
         note = f"{TASKS} x {EPISODES} x {FRAMES} frames of {SIZE}x{SIZE}"
         report.add(f"LeRobot import, {name}", rate, "frames/s", note=note)

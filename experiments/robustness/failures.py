@@ -116,7 +116,7 @@ def live(folder: pathlib.Path, at: int, kind: str) -> None:
         if not (folder / "set").exists():
             source = Robomimic(folder.parent / "demos.hdf5", "", "robot", "actions", 8)
             found = source.episodes(str(folder.parent / "tasks.json"))
-            episodes.write(folder / "set", found, source.sizes, (0.2, 0.2), "a recording")
+            episodes.write(folder / "set", found, source.contents, (0.2, 0.2), "a recording")
         config = recorded.config_for(folder / "set", preset="cpu")
         config.recorded.horizon, config.network.fc_layers = 6, (8,)
         config.train.meta_batch, config.train.log_every, config.train.eval_every = 2, 2, 4
