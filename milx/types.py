@@ -106,6 +106,7 @@ class Spec:
         fps: time steps in a second of recorded demonstrations; None if it is not known.
         state_names: of the entries of the state; empty if they have none.
         action_names: of the entries of the action, likewise.
+        class_indices: indices of the entries of the action that take two values, such as an open and a closed gripper.
     """
 
     image_shape: ImageShape
@@ -119,6 +120,7 @@ class Spec:
     fps: float | None = None
     state_names: tuple[str, ...] = ()
     action_names: tuple[str, ...] = ()
+    class_indices: tuple[int, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Returns the fields as a dictionary that can be written as JSON, with the version of their layout."""
@@ -154,6 +156,7 @@ class Spec:
             "goal_indices": _is_table(spec.goal_indices, (goal,), 0, size),
             "image_to_goal": spec.image_to_goal is None or _is_table(spec.image_to_goal, (3, goal)),
             "object_indices": _is_table(spec.object_indices, (objects, 2), 0, size),
+            "class_indices": are_indices(spec.class_indices, actions),
             "fps": spec.fps is None or _is_table((spec.fps,), (1,)),
             "state_names": _are_texts(spec.state_names, size),
             "action_names": _are_texts(spec.action_names, actions),
@@ -205,6 +208,11 @@ def _as_tuple(value: Any) -> Any:
     if isinstance(value, dict):
         return {name: _as_tuple(each) for name, each in value.items()}
     return tuple(_as_tuple(each) for each in value) if isinstance(value, list) else value
+
+
+def are_indices(value: Any, size: int) -> bool:
+    """Tells whether a value is a tuple of different indices below `size`."""
+    return isinstance(value, tuple) and len(set(value)) == len(value) and _is_table(value, (len(value),), 0, size)
 
 
 def _are_texts(value: Any, count: int) -> bool:

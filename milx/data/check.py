@@ -30,6 +30,7 @@ def problems(data: DataSet) -> list[str]:
         finite = values[np.isfinite(values).all(axis=1)]
         for i in np.flatnonzero(finite.std(axis=0) < MIN_STD).tolist() if len(finite) else ():
             found.append(f"{entry(head, field, i)} is constant: it says nothing")
+    found += _classes(head, vectors(data).get("action", np.zeros((0, head.action_size))))
     for number, task in enumerate(head.tasks):
         if head.image_shape is not None and task.lengths:
             seen = data.read(number, 0, np.zeros(1, int), fields=("image",)).image
@@ -66,6 +67,20 @@ def _refusals(data: DataSet) -> list[str]:
                 step, i = np.argwhere(~(np.abs(values) <= LARGEST))[0].tolist()
                 where = f"demonstration {demo} of task {task.name!r}, time step {step}"
                 found.append(f"{entry(head, field, i)} is {values[step, i]} in {where}: training refuses this")
+    return found
+
+
+def _classes(head: Header, actions: np.ndarray) -> list[str]:
+    """Finds entries of the actions that take two values and are not marked so, and the opposite."""
+    found = []
+    for i in range(head.action_size):
+        count, name = len(np.unique(actions[:, i])), entry(head, "action", i)
+        if i in head.class_indices and count > 2:
+            found.append(
+                f"{name} is marked as taking two values and has {count}: the policy does the smallest or largest"
+            )
+        elif i not in head.class_indices and count == 2:
+            found.append(f"{name} takes two values: import it with --classes={i}, and they are learned as classes")
     return found
 
 

@@ -51,6 +51,7 @@ class Writer:
         fps: time steps in a second; None if it is not known.
         state_names: of the entries of the state; none if they have none.
         action_names: of the entries of the action, likewise.
+        class_indices: indices of the entries of the action that take two values, such as an open and a closed gripper.
 
     Raises:
         ValueError: if the folder exists, as nothing is written over, there are no actions, or for sizes and names that
@@ -67,6 +68,7 @@ class Writer:
         fps: float | None = None,
         state_names: Sequence[str] = (),
         action_names: Sequence[str] = (),
+        class_indices: Sequence[int] = (),
     ):
         self.folder = pathlib.Path(folder)
         if self.folder.exists():
@@ -76,6 +78,7 @@ class Writer:
         self._header = parse_header(
             {"image_shape": image_shape, "state_size": state_size, "action_size": action_size, "tasks": ()}
             | {"source": source, "fps": fps, "state_names": state_names, "action_names": action_names}
+            | {"class_indices": class_indices}
         )
         self._tasks: list[TaskInfo] = []
         self._stack = contextlib.ExitStack()
@@ -176,6 +179,8 @@ class DataSet:
         header = dataclasses.asdict(self.header)
         for name in ("fps", "state_names", "action_names"):
             del header[name]
+        if not header["class_indices"]:  # as in the fingerprints of data sets that have none
+            del header["class_indices"]
         for task in header["tasks"]:
             del task["family"], task["instructions"]
         digest = hashlib.sha256(json.dumps(header).encode())

@@ -49,6 +49,7 @@ class Contents(NamedTuple):
     fps: float | None = None
     state_names: tuple[str, ...] = ()
     action_names: tuple[str, ...] = ()
+    class_indices: tuple[int, ...] = ()
 
 
 class Source(Protocol):
@@ -68,6 +69,8 @@ def define_flags(*, state: str, action: str, task: str) -> None:
     flags.DEFINE_string("state", state, parts)
     flags.DEFINE_string("action", action, "Where the actions are; empty for none.")
     flags.DEFINE_string("task", task, "What makes a task: see above.")
+    two = "Entries of the action that take two values, such as a gripper's, by name or index, separated by commas."
+    flags.DEFINE_string("classes", "", two)
     some = "Episodes to import, separated by commas: names, numbers, 0-99, or patterns like 'lift/*'; all if empty."
     flags.DEFINE_string("episodes", "", some)
     bad = "Leave out episodes that cannot be read or hold numbers that are not finite, and report them."
@@ -105,10 +108,25 @@ def run(argv: list[str], open_source: Callable[[str, Any], Source]) -> None:
         episodes = selected(source.episodes(FLAGS.task), FLAGS.episodes)
         if FLAGS.skip_bad:
             episodes = readable(episodes)
+        contents = with_classes(source.contents, FLAGS.classes)
         families = splits.families_of({episode.task for episode in episodes}, FLAGS.family)
         chosen = None if FLAGS.splits is None else splits.read_patterns(FLAGS.splits)
-        write(argv[2], episodes, source.contents, (FLAGS.validation, FLAGS.test), argv[1], families, chosen)
+        write(argv[2], episodes, contents, (FLAGS.validation, FLAGS.test), argv[1], families, chosen)
         print(f"{argv[2]}: look at it with `python -m milx.data.check {argv[2]}`")
+
+
+def with_classes(contents: Contents, wanted: str) -> Contents:
+    """Marks entries of the action, by name or index, separated by commas, as those that take two values.
+
+    Raises:
+        ValueError: for an entry that does not exist.
+    """
+    names = contents.action_names or tuple(map(str, range(contents.action_size)))
+    known = {str(i): i for i in range(contents.action_size)} | {name: i for i, name in enumerate(names)}
+    entries = [entry for entry in wanted.split(",") if entry]
+    if unknown := [entry for entry in entries if entry not in known]:
+        raise ValueError(f"classes: got {unknown[0]!r}, expected some of {', '.join(names)}, or their indices")
+    return contents._replace(class_indices=tuple(dict.fromkeys(known[entry] for entry in entries)))
 
 
 def selected(episodes: Iterable[Episode], wanted: str) -> list[Episode]:

@@ -7,7 +7,7 @@ from typing import Any
 
 from milx.core import files
 from milx.core.files import FileError
-from milx.types import SPLITS, ImageShape, by_field, is_image_shape
+from milx.types import SPLITS, ImageShape, are_indices, by_field, is_image_shape
 
 VERSION = 2
 """The number of the layout of data sets. Those of version 1 have one camera."""
@@ -47,6 +47,7 @@ class Header:
         fps: time steps in a second; None if it is not known.
         state_names: of the entries of the state; empty if they have none.
         action_names: of the entries of the action, likewise.
+        class_indices: indices of the entries of the action that take two values, such as an open and a closed gripper.
     """
 
     image_shape: ImageShape
@@ -57,6 +58,7 @@ class Header:
     fps: float | None = None
     state_names: tuple[str, ...] = ()
     action_names: tuple[str, ...] = ()
+    class_indices: tuple[int, ...] = ()
 
     def of_split(self, split: str) -> list[int]:
         """Lists the numbers of the split's tasks."""
@@ -114,8 +116,13 @@ def parse_header(values: dict[str, Any]) -> Header:
     fps = values.get("fps")
     if fps is not None and (type(fps) not in (int, float) or not 0 < fps < 1e6):
         raise ValueError(f"fps: got {fps!r:.100}, expected a positive number")
-    names = (_texts(f"{field}_names", values.get(f"{field}_names", ()), values[f"{field}_size"]) for field in _VECTORS)
-    return Header(shape, *sizes, tuple(tasks), str(values["source"]), fps, *names)
+    state_names, action_names = (
+        _texts(f"{field}_names", values.get(f"{field}_names", ()), values[f"{field}_size"]) for field in _VECTORS
+    )
+    classes = tuple(values.get("class_indices", ()))
+    if not are_indices(classes, sizes[1]):
+        raise ValueError(f"class_indices: got {classes!r:.100}, expected different indices below {sizes[1]}")
+    return Header(shape, *sizes, tuple(tasks), str(values["source"]), fps, state_names, action_names, classes)
 
 
 _VECTORS = "state", "action"

@@ -52,9 +52,15 @@ def make(config: Config, spec: Spec) -> Method:
     chunk, execute = config.method.chunk, config.method.execute
     if execute > chunk:
         raise ValueError(f"method.execute: got {execute}, expected at most method.chunk = {chunk}")
-    method = entry.make(config, dataclasses.replace(spec, action_size=chunk * spec.action_size))
+    whole = dataclasses.replace(spec, action_size=chunk * spec.action_size, class_indices=classes(config, spec))
+    method = entry.make(config, whole)
     assert isinstance(method, Method)
-    return method if chunk == 1 else Chunked(method, chunk, execute, spec.action_size)
+    return method if chunk == 1 else Chunked(method, chunk, execute, spec.action_size, spec.class_indices)
+
+
+def classes(config: Config, spec: Spec) -> tuple[int, ...]:
+    """Lists the entries of what a method predicts, an action or a chunk of them, that take two values."""
+    return tuple(step * spec.action_size + i for step in range(config.method.chunk) for i in spec.class_indices)
 
 
 def params_like(method: Method, spec: Spec) -> Params:

@@ -19,19 +19,22 @@ class Chunked(Method):
 
     At time step t the policy has the chunks p_t, p_{t-1}, .., p_{t-C+1}, of which p_{t-i} says p_{t-i}[i] of this step.
     With `execute` E >= 1 it does p_{t-i}[i] with i = t mod E: E actions of every E-th chunk. With 0 it does the mean of
-    all that there are, with weights exp(FADE i), so that the oldest counts most.
+    all that there are, with weights exp(FADE i), so that the oldest counts most; entries that take
+    two values are those of the newest chunk then.
 
     Attributes:
         method: predicts chunks; demonstrations and whitening have them, too.
         chunk: C.
         execute: E.
         action_size: A.
+        class_indices: entries of the action that take two values.
     """
 
     method: Method
     chunk: int = dataclasses.field()  # without the default of the class above
     execute: int
     action_size: int
+    class_indices: tuple[int, ...] = ()
 
     @property
     def predictor(self) -> Method:
@@ -77,6 +80,9 @@ class Chunked(Method):
         if self.execute:
             weight = (age == step % self.execute).astype(flat.dtype)
         action = weight @ says / weight.sum()
+        if not self.execute:
+            for i in self.class_indices:
+                action = action.at[i].set(plan[0, i])
         return action, {"method": inner, "plans": plans, "step": step + 1}
 
     def initial_memory(self, key: jax.Array) -> Memory:

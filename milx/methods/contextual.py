@@ -41,6 +41,7 @@ class ContextPolicy(Method):
     network: ContextNetwork
     goal_indices: tuple[int, ...] = ()
     image_to_goal: tuple[tuple[float, ...], ...] | None = None
+    class_indices: tuple[int, ...] = ()
 
     def init(self, key: jax.Array, whitening: Whitening) -> Params:
         """Draws the networks' parameters."""
@@ -71,7 +72,8 @@ class ContextPolicy(Method):
 
             def one(context: Any) -> tuple[jax.Array, dict[str, jax.Array]]:
                 output = self.network.apply(task_params, context, seen.image, whitening.state(seen.state))
-                return behavioral_cloning(self.config, output, output.action, query, whitening, self.goal_indices)
+                indices = self.goal_indices, self.class_indices
+                return behavioral_cloning(self.config, output, output.action, query, whitening, *indices)
 
             return jax.tree.map(jnp.mean, jax.vmap(one)(task_params["context"]))
 
@@ -83,7 +85,8 @@ class ContextPolicy(Method):
         whitening, batch = task_params["whitening"], jax.tree.map(lambda x: x[None], observation)
         state = whitening.state(batch.state)
         apply = jax.vmap(lambda context: self.network.apply(task_params, context, batch.image, state).action[0])
-        return whitening.unwhiten_action(apply(task_params["context"]).mean(axis=0)), memory
+        action = apply(task_params["context"]).mean(axis=0)
+        return whitening.unwhiten_action(action, self.class_indices), memory
 
 
 def make_contextual(config: Config, spec: Spec) -> ContextPolicy:
@@ -120,4 +123,4 @@ def _actor(network: ContextConfig, spec: Spec) -> Actor:
 
 
 def _with_context(config: Config, spec: Spec, network: ContextNetwork) -> ContextPolicy:
-    return ContextPolicy(config.method, network, spec.goal_indices, calibration(config, spec))
+    return ContextPolicy(config.method, network, spec.goal_indices, calibration(config, spec), spec.class_indices)

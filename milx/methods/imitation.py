@@ -37,6 +37,7 @@ def behavioral_cloning(
     demo: Demo,
     whitening: Whitening,
     goal_indices: tuple[int, ...],
+    class_indices: tuple[int, ...] = (),
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
     """Computes the imitation loss of demonstrations (eq. 2), with those of a goal head and a target head.
 
@@ -44,7 +45,8 @@ def behavioral_cloning(
 
     The mean is over demonstrations, time steps and entries of the whitened action; m is `config.loss_scale` and w is
     `config.goal_weight`. L_goal is the goal head's mean negative log-likelihood, and L_target is the target head's mean
-    squared error.
+    squared error. For an entry of the action that is a class, a = -1 or 1, the loss is m^2 log(1 + exp(-2 a a_hat)) in
+    the place of the square: the negative log-likelihood of a with the probability 1 / (1 + exp(-2 a_hat)) of 1.
 
     Args:
         config: scale and weight of the losses.
@@ -53,13 +55,18 @@ def behavioral_cloning(
         demo: demonstrations [K, T, ...].
         whitening: of `demo`.
         goal_indices: entries of the state that the goal head predicts.
+        class_indices: entries of the action that are classes.
 
     Returns:
         The sum, and its parts.
     """
     seen = flat(demo)
-    error = config.loss_scale * (action - whitening.action(seen.action))
-    action_loss = jnp.mean(jnp.square(error))
+    white = whitening.action(seen.action)
+    loss = jnp.square(config.loss_scale * (action - white))
+    for i in class_indices:
+        likelihood = jax.nn.softplus(-2 * jnp.sign(white[:, i]) * action[:, i])
+        loss = loss.at[:, i].set(config.loss_scale**2 * likelihood)
+    action_loss = jnp.mean(loss)
     of_heads = head_losses(output, demo, whitening, goal_indices)
     return action_loss + config.goal_weight * sum(of_heads.values()), {"action_loss": action_loss, **of_heads}
 

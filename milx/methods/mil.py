@@ -109,12 +109,14 @@ class MIL(Method):
         goal_indices: entries of the state that the goal head predicts.
         image_to_goal: [3, G] from (x, y, 1), x and y in [-1, 1] across and down the image, to those entries, to start
             the goal heads from; None without one, or if they must learn that by themselves.
+        class_indices: entries of the action that take two values.
     """
 
     config: MILConfig
     network: PolicyNetwork
     goal_indices: tuple[int, ...] = ()
     image_to_goal: tuple[tuple[float, ...], ...] | None = None
+    class_indices: tuple[int, ...] = ()
 
     @property
     def imitation_steps(self) -> int:
@@ -229,7 +231,7 @@ class MIL(Method):
         whitening, batch = task_params["whitening"], jax.tree.map(lambda x: x[None], observation)
         target = memory[None] if self.network.has_target else None
         output = self.network.apply(task_params["policy"], batch.image, whitening.state(batch.state), 1, target)
-        action = whitening.unwhiten_action(output.action[0])
+        action = whitening.unwhiten_action(output.action[0], self.class_indices)
         return action, memory if output.target is None else output.target[0]
 
     def initial_memory(self, key: jax.Array) -> Memory:
@@ -278,7 +280,8 @@ class MIL(Method):
         whitening = jax.lax.stop_gradient(whitening)
         output = self._apply(theta, whitening, demo)
         action = output.inner_action if inner else output.action
-        return behavioral_cloning(self.config, output, action, demo, whitening, self.goal_indices)
+        indices = self.goal_indices, self.class_indices
+        return behavioral_cloning(self.config, output, action, demo, whitening, *indices)
 
 
 def make_mil(config: Config, spec: Spec) -> MIL:
@@ -292,7 +295,7 @@ def make_mil(config: Config, spec: Spec) -> MIL:
     _check_variant(settings, network, config.train.steps)
     _check_inner_loss(settings, network, has_goal_head=bool(network.goal_head and spec.goal_indices))
     policy = make_policy(network, spec.image_shape, spec.state_size, spec.action_size, len(spec.goal_indices))
-    return MIL(settings, policy, spec.goal_indices, calibration(config, spec))
+    return MIL(settings, policy, spec.goal_indices, calibration(config, spec), spec.class_indices)
 
 
 def _check_variant(settings: MILConfig, network: PolicyConfig, steps: int) -> None:

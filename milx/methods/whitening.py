@@ -37,15 +37,18 @@ class Whitening:
         """Whitens actions [..., A]."""
         return (action - self.action_mean) / self.action_scale
 
-    def unwhiten_action(self, action: jax.Array) -> jax.Array:
-        """Inverts `action`."""
+    def unwhiten_action(self, action: jax.Array, class_indices: tuple[int, ...] = ()) -> jax.Array:
+        """Inverts `action`; entries that are classes become the nearer of their two values."""
+        for i in class_indices:
+            action = action.at[..., i].set(jnp.where(action[..., i] < 0, -1.0, 1.0))
         return action * self.action_scale + self.action_mean
 
 
-def fit(state: jax.Array, action: jax.Array, whiten_actions: bool) -> Whitening:
+def fit(state: jax.Array, action: jax.Array, whiten_actions: bool, class_indices: tuple[int, ...] = ()) -> Whitening:
     """Computes statistics over all leading axes of states [..., S] and actions [..., A] of the training tasks.
 
-    With `whiten_actions` false, actions pass unchanged.
+    With `whiten_actions` false, actions pass unchanged. Entries of actions that are classes become -1 and 1 in any
+    case, for the smaller and the larger of their two values.
     """
 
     def moments(x: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -55,4 +58,8 @@ def fit(state: jax.Array, action: jax.Array, whiten_actions: bool) -> Whitening:
     action_mean, action_scale = moments(action)
     if not whiten_actions:
         action_mean, action_scale = jnp.zeros_like(action_mean), jnp.ones_like(action_scale)
+    for i in class_indices:
+        low, high = action[..., i].min(), action[..., i].max()
+        action_mean = action_mean.at[i].set((low + high) / 2)
+        action_scale = action_scale.at[i].set(jnp.maximum((high - low) / 2, MIN_STD))
     return Whitening(*moments(state), action_mean, action_scale)

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 
+from milx import methods
 from milx.config import assemble
 from milx.config.check import check_config
 from milx.config.schema import GIVEN, Config, ConvConfig
@@ -64,6 +65,7 @@ def spec_of(data: DataSet, config: Config) -> Spec:
         fps=head.fps,
         state_names=head.state_names,
         action_names=head.action_names,
+        class_indices=head.class_indices,
     )
 
 
@@ -182,7 +184,8 @@ class RecordedRun(Run):
             Client(make, evaluation.gym_python or sys.executable, evaluation.gym_timeout).close()
         with self.clock("demos"), self.phase("reading demonstrations"):
             state, action = self._vectors
-            statistics = whitening.fit(jnp.asarray(state), jnp.asarray(action), self.config.method.whiten_actions)
+            vectors, classes = (jnp.asarray(state), jnp.asarray(action)), methods.classes(self.config, self.spec)
+            statistics = whitening.fit(*vectors, self.config.method.whiten_actions, classes)
             dataset_hash = self.data.fingerprint()
             held_out = [i for split in ("validation", "test") for i in self.data.header.of_split(split)]
             read_vectors(self.data, held_out, self.config.recorded.horizon)  # refuses what is not finite

@@ -70,6 +70,14 @@ def test_nothing_is_wrong_with_a_good_set(tmp_path):
             "action[0] is constant: it says nothing",
         ),
         (
+            lambda tasks: [
+                demos.__setitem__(i, with_column(d, "action", 0, np.arange(len(d.action)) % 2))
+                for _, demos in tasks
+                for i, d in enumerate(demos)
+            ],
+            "action[0] takes two values: import it with --classes=0",
+        ),
+        (
             lambda tasks: tasks[0][1].__setitem__(
                 0, dataclasses.replace(good(), image=np.full((10, 8, 8, 3), 7, np.uint8))
             ),
