@@ -76,9 +76,7 @@ def _classes(head: Header, actions: np.ndarray) -> list[str]:
     for i in range(head.action_size):
         count, name = len(np.unique(actions[:, i])), entry(head, "action", i)
         if i in head.class_indices and count > 2:
-            found.append(
-                f"{name} is marked as taking two values and has {count}: the policy does the smallest or largest"
-            )
+            found.append(f"{name} is marked as taking two values and has {count}: only the outermost will be done")
         elif i not in head.class_indices and count == 2:
             found.append(f"{name} takes two values: import it with --classes={i}, and they are learned as classes")
     return found

@@ -137,7 +137,7 @@ def test_some_episodes_are_selected_and_bad_ones_left_out(copy, capsys):
 
 def test_states_and_actions_may_lack():
     source = open_set(camera="", action="")
-    assert source.contents == (None, 4, 0, make_lerobot.FPS, ("a", "b", "c", "d"), ())
+    assert source.contents == (None, 4, 0, make_lerobot.FPS, ("a", "b", "c", "d"), (), ())
     (demo,) = (episode.read() for episode in source.episodes("task_index")[:1])
     assert demo.image is None
     assert demo.action is None
