@@ -18,7 +18,7 @@
 #include <stdlib.h>
 #include <string.h>
 #include <sys/stat.h>
-#include <sys/syscall.h>
+#include <sys/uio.h>
 #include <unistd.h>
 
 static atomic_int count;
@@ -89,12 +89,21 @@ static const char *opened(int file, char *room) {
         REAL(name);                                                               \
         return real given;                                                        \
     }
+#define VECTOR(name, declared, given) WRITE(name, ssize_t, declared, given)
+#define STREAM(name)                                                              \
+    FILE *name(const char *path, const char *how) {                               \
+        char room[PATH_MAX];                                                      \
+        if (due(#name, absolute(AT_FDCWD, path, room))) return NULL;              \
+        REAL(name);                                                               \
+        return real(path, how);                                                   \
+    }
+#define NEEDS_MODE(how) ((how) & O_CREAT || ((how) & O_TMPFILE) == O_TMPFILE)
 #define OPEN(name)                                                                \
     int name(const char *path, int how, ...) {                                    \
         char room[PATH_MAX];                                                      \
         va_list more;                                                             \
         va_start(more, how);                                                      \
-        mode_t mode = how & (O_CREAT | O_TMPFILE) ? va_arg(more, mode_t) : 0;     \
+        mode_t mode = NEEDS_MODE(how) ? va_arg(more, mode_t) : 0;                 \
         va_end(more);                                                             \
         if (due(#name, absolute(AT_FDCWD, path, room))) return -1;                \
         REAL(name);                                                               \
@@ -105,7 +114,7 @@ static const char *opened(int file, char *room) {
         char room[PATH_MAX];                                                      \
         va_list more;                                                             \
         va_start(more, how);                                                      \
-        mode_t mode = how & (O_CREAT | O_TMPFILE) ? va_arg(more, mode_t) : 0;     \
+        mode_t mode = NEEDS_MODE(how) ? va_arg(more, mode_t) : 0;                 \
         va_end(more);                                                             \
         if (due(#name, absolute(folder, path, room))) return -1;                  \
         REAL(name);                                                               \
@@ -119,6 +128,12 @@ OPENAT(openat64)
 WRITE(write, ssize_t, (int file, const void *bytes, size_t size), (file, bytes, size))
 WRITE(pwrite, ssize_t, (int file, const void *bytes, size_t size, off_t at), (file, bytes, size, at))
 WRITE(pwrite64, ssize_t, (int file, const void *bytes, size_t size, off64_t at), (file, bytes, size, at))
+VECTOR(writev, (int file, const struct iovec *parts, int size), (file, parts, size))
+VECTOR(readv, (int file, const struct iovec *parts, int size), (file, parts, size))
+VECTOR(pwritev, (int file, const struct iovec *parts, int size, off_t at), (file, parts, size, at))
+VECTOR(preadv, (int file, const struct iovec *parts, int size, off_t at), (file, parts, size, at))
+STREAM(fopen)
+STREAM(fopen64)
 WRITE(read, ssize_t, (int file, void *bytes, size_t size), (file, bytes, size))
 WRITE(pread, ssize_t, (int file, void *bytes, size_t size, off_t at), (file, bytes, size, at))
 WRITE(pread64, ssize_t, (int file, void *bytes, size_t size, off64_t at), (file, bytes, size, at))

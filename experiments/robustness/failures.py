@@ -229,7 +229,10 @@ def main(_: list[str]) -> None:
         folder = pathlib.Path(name)
         write_recording(folder)
         library = compile_calls(folder) if FLAGS.calls else None
-        kinds = FLAGS.kinds or (CALL_KINDS if FLAGS.calls else KINDS)
+        possible = CALL_KINDS if FLAGS.calls else KINDS
+        kinds = FLAGS.kinds or possible
+        if unknown := sorted(set(kinds) - set(possible)):
+            raise app.UsageError(f"--kinds: got {unknown[0]!r}, expected some of {', '.join(possible)}")
         for number in range(2):  # the first one compiles
             (folder / f"good{number}").mkdir()
             good = begin(folder / f"good{number}", library=library)

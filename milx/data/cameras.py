@@ -22,7 +22,7 @@ def named(sources: str) -> dict[str, str]:
     if len(listed) == 1:
         return {"": listed[0]}
     names = [source.rpartition(".")[2].removesuffix("_image") for source in listed]
-    if len(set(names)) < len(names):
+    if len(set(names)) < len(names) or not all(names):
         raise ValueError(f"camera: got {sources}, which are called {', '.join(names)}; expected different names")
     return dict(zip(names, listed, strict=True))
 

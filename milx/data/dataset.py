@@ -25,7 +25,7 @@ import tensorstore as ts
 
 from milx.core import files
 from milx.core.files import MAX_BYTES, FileError
-from milx.data.header import VERSION, Header, TaskInfo, parse_header, read_header
+from milx.data.header import VERSION, Header, TaskInfo, parse_header, read_header, texts
 from milx.types import SPLITS, Demo, ImageShape, by_field, from_fields, is_image
 
 ALL_FIELDS = ("image", "state", "action")
@@ -123,6 +123,7 @@ class Writer:
         """
         if 0 in lengths:
             raise ValueError(f"demonstration {lengths.index(0)} of {name!r}: got no time steps, expected at least one")
+        texts(f"instructions of {name!r}", instructions, len(lengths))
         if split not in SPLITS:
             raise ValueError(f"split of {name!r}: got {split!r}, expected one of {', '.join(SPLITS)}")
         folder, total, head = self._partial / f"{len(self._tasks):05d}", sum(lengths), self._header
@@ -204,8 +205,7 @@ class DataSet:
         """Starts reading a demonstration; the result is a function that waits for it and returns it."""
         info = self.header.tasks[task]
         there = set(_fields(self.header)) - ({"action"} if not info.has_action[demo] else set())
-        wanted = {name for name in there if name.partition(".")[0] in fields}
-        arrays = {name: self._array(task, name) for name in sorted(wanted)}
+        arrays = {name: self._array(task, name) for name in _fields(self.header) if _is_wanted(name, there, fields)}
         count = info.lengths[demo] if frames is None else len(frames)
         for field, array in arrays.items():
             check_size(
@@ -270,6 +270,10 @@ def _fields(header: Header) -> dict[str, tuple[tuple[int, ...], Any]]:
     if header.state_size:
         fields["state"] = ((header.state_size,), np.float32)
     return fields | {name: ((*size, 3), np.uint8) for name, size in by_field(header.image_shape).items()}
+
+
+def _is_wanted(name: str, there: set[str], fields: tuple[str, ...]) -> bool:
+    return name in there and name.partition(".")[0] in fields
 
 
 def _kvstore(path: pathlib.Path) -> dict[str, str]:

@@ -26,7 +26,7 @@ class Episode(NamedTuple):
     Attributes:
         name: what the source calls it, by number or by name.
         task: the name of its task.
-        length: its time steps.
+        length: its time steps; 0 if it cannot be read, and `read` says why.
         has_action: whether it shows actions.
         read: reads its arrays; images may be larger than the data set's.
         instruction: what the source says was to be done; "" for nothing.
@@ -106,9 +106,9 @@ def run(argv: list[str], open_source: Callable[[str, Any], Source]) -> None:
     with command():
         source = open_source(argv[1], FLAGS)
         episodes = selected(source.episodes(FLAGS.task), FLAGS.episodes)
-        if FLAGS.skip_bad:
-            episodes = readable(episodes)
         contents = with_classes(source.contents, FLAGS.classes)
+        if FLAGS.skip_bad:
+            episodes = readable(episodes, contents)
         families = splits.families_of({episode.task for episode in episodes}, FLAGS.family)
         chosen = None if FLAGS.splits is None else splits.read_patterns(FLAGS.splits)
         write(argv[2], episodes, contents, (FLAGS.validation, FLAGS.test), argv[1], families, chosen)
@@ -147,37 +147,45 @@ def _fits(name: str, pattern: str) -> bool:
     numbers = re.fullmatch(r"(\d+)-(\d+)", pattern)
     if numbers and name.isdecimal():
         return int(numbers[1]) <= int(name) <= int(numbers[2])
-    return fnmatch.fnmatchcase(name, pattern)
+    return name == pattern or fnmatch.fnmatchcase(name, pattern)
 
 
-def readable(episodes: Iterable[Episode]) -> list[Episode]:
-    """Reads all episodes, and leaves out and reports those that cannot be read or hold numbers that are not finite."""
+def readable(episodes: Iterable[Episode], contents: Contents) -> list[Episode]:
+    """Reads all episodes, and leaves out and reports those for which `checked` raises an error."""
     kept = []
     for episode in track(list(episodes), "reading episodes"):
         try:
-            checked(episode)
-        except ValueError as error:
+            checked(episode, contents)
+        except (ValueError, OSError) as error:
             warn(f"episode {episode.name} is left out: {error}")
             continue
         kept.append(episode)
     return kept
 
 
-def checked(episode: Episode) -> Demo:
-    """Reads an episode.
+def checked(episode: Episode, contents: Contents) -> Demo:
+    """Reads an episode, with states and actions in float32.
 
     Raises:
-        ValueError: if it cannot be read, or a number is not finite; the message names the episode and the time step.
+        ValueError: if it cannot be read, has other sizes, or holds a number that is not finite in float32; the message
+            names the episode and the time step.
     """
     demo = episode.read()
-    for field in ("state", "action"):
-        value = getattr(demo, field)
-        if value is None or np.isfinite(value).all():
+    vectors = {"state": demo.state if contents.state_size else None, "action": demo.action}
+    for field, value in vectors.items():
+        if value is None:
             continue
-        step, entry = np.argwhere(~np.isfinite(value))[0].tolist()
-        got = f"got {value[step, entry]} at time step {step}"
-        raise ValueError(f"{field}[{entry}] of episode {episode.name}: {got}, expected finite numbers (--skip_bad)")
-    return demo
+        with np.errstate(over="ignore"):
+            value = vectors[field] = np.asarray(value, np.float32)
+        expected = (episode.length, getattr(contents, f"{field}_size"))
+        if value.shape != expected:
+            got = f"got shape {list(value.shape)}, expected {list(expected)}"
+            raise ValueError(f"{field} of episode {episode.name}: {got} (--skip_bad leaves it out)")
+        if not np.isfinite(value).all():
+            step, entry = np.argwhere(~np.isfinite(value))[0].tolist()
+            got = f"got {value[step, entry]} at time step {step}, expected finite numbers"
+            raise ValueError(f"{field}[{entry}] of episode {episode.name}: {got} (--skip_bad leaves it out)")
+    return Demo(cameras.fitted(demo.image, contents.image_shape), **vectors)
 
 
 def write(
@@ -212,13 +220,8 @@ def write(
     with Writer(out, source=source, **contents._asdict()) as writer:
         for name in track(sorted(tasks), "writing tasks"):
             own = tasks[name]
-            demos = (_as_written(episode, contents) for episode in own)
+            for broken in (episode for episode in own if not episode.length):
+                broken.read()  # says what is wrong with it
+            demos = (checked(episode, contents) for episode in own)
             lengths, said = [episode.length for episode in own], [episode.instruction for episode in own]
             writer.add(name, split_of[name], lengths, demos, families[name], said)
-
-
-def _as_written(episode: Episode, contents: Contents) -> Demo:
-    demo = checked(episode)
-    action = None if demo.action is None else np.asarray(demo.action, np.float32)
-    state = np.asarray(demo.state, np.float32) if contents.state_size else None
-    return Demo(cameras.fitted(demo.image, contents.image_shape), state, action)

@@ -1,6 +1,7 @@
 """What a data set says of itself: sizes, and the name, split, family and demonstrations of every task."""
 
 import dataclasses
+import numbers
 import pathlib
 import re
 from typing import Any
@@ -101,7 +102,7 @@ def parse_header(values: dict[str, Any]) -> Header:
     tasks = []
     for i, task in enumerate(values["tasks"]):
         lengths, has_action = tuple(task["lengths"]), tuple(task["has_action"])
-        said = _texts(f"tasks[{i}].instructions", task.get("instructions", ()), len(lengths))
+        said = texts(f"tasks[{i}].instructions", task.get("instructions", ()), len(lengths))
         info = TaskInfo(task["name"], task["split"], lengths, has_action, task.get("family", ""), said)
         for field in ("name", "family"):
             if not isinstance(getattr(info, field), str):
@@ -114,10 +115,12 @@ def parse_header(values: dict[str, Any]) -> Header:
             raise ValueError(f"tasks[{i}].has_action: got {len(info.has_action)}, expected {len(info.lengths)}")
         tasks.append(info)
     fps = values.get("fps")
-    if fps is not None and (type(fps) not in (int, float) or not 0 < fps < 1e6):
-        raise ValueError(f"fps: got {fps!r:.100}, expected a positive number")
+    if fps is not None:
+        if not isinstance(fps, numbers.Real) or isinstance(fps, bool) or not 0 < float(fps) < 1e6:
+            raise ValueError(f"fps: got {fps!r:.100}, expected a positive number")
+        fps = float(fps)
     state_names, action_names = (
-        _texts(f"{field}_names", values.get(f"{field}_names", ()), values[f"{field}_size"]) for field in _VECTORS
+        texts(f"{field}_names", values.get(f"{field}_names", ()), values[f"{field}_size"]) for field in _VECTORS
     )
     classes = tuple(values.get("class_indices", ()))
     if not are_indices(classes, sizes[1]):
@@ -128,8 +131,16 @@ def parse_header(values: dict[str, Any]) -> Header:
 _VECTORS = "state", "action"
 
 
-def _texts(field: str, value: Any, count: int) -> tuple[str, ...]:
-    """Checks texts, one for each of `count` things or none at all."""
+def _as_size(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list | tuple) else value
+
+
+def texts(field: str, value: Any, count: int) -> tuple[str, ...]:
+    """Checks texts, one for each of `count` things or none at all.
+
+    Raises:
+        ValueError: for anything else.
+    """
     if not isinstance(value, list | tuple) or len(value) not in (0, count):
         raise ValueError(f"{field}: got {value!r:.100}, expected {count} texts, or none")
     if not all(isinstance(text, str) for text in value):
@@ -144,11 +155,13 @@ def check_cameras(shape: Any) -> ImageShape:
         ValueError: for sizes that are not two whole numbers, or a camera whose name cannot be that of a file.
     """
     if isinstance(shape, dict):
+        if len(shape) == 1:
+            raise ValueError(f"cameras: got {shape!r:.100}, expected (H, W): a single camera has no name")
         if bad := [name for name in shape if not re.fullmatch(r"[A-Za-z0-9_-]{1,64}", name)] or not shape:
             raise ValueError(f"cameras: got the names {bad!r:.200}, expected letters, digits, '_' and '-'")
-        shape = {name: tuple(size) for name, size in shape.items()}
+        shape = {name: _as_size(size) for name, size in shape.items()}
     elif shape is not None:
-        shape = tuple(shape)
+        shape = _as_size(shape)
     for field, size in by_field(shape).items():
         if not is_image_shape(size):
             raise ValueError(f"{field}: got the shape {size!r:.100}, expected two whole numbers")

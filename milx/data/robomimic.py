@@ -72,10 +72,10 @@ class Robomimic:
                 for demo in _demos(file):
                     name = f"{path.stem}/{demo}"
                     own = path.stem if mapping is None else lookup(mapping, name, task, "task")
-                    length = self._length(file, demo)
-                    found.append(
-                        Episode(name, own, length, bool(self.action), functools.partial(self._read, path, demo))
-                    )
+                    length, read = 0, functools.partial(self._read, path, demo)
+                    with contextlib.suppress(FileError):  # reading it says what is wrong
+                        length = self._length(file, demo)
+                    found.append(Episode(name, own, length, bool(self.action), read))
         return found
 
     def _names(self, demo: str) -> dict[str, int]:
@@ -94,6 +94,7 @@ class Robomimic:
 
     def _read(self, path: pathlib.Path, demo: str) -> Demo:
         with _open(path) as file:
+            self._length(file, demo)
             lead = f"data/{demo}"
             action = _dataset(file, f"{lead}/{self.action}", 2)[:] if self.action else None
             states = [_dataset(file, f"{lead}/obs/{name}", 2)[:] for name in self.state]

@@ -61,6 +61,7 @@ def write(data: DataSet, out: pathlib.Path, fps: float) -> None:
             info = data.header.tasks[episode.task]
             demo = data.read(episode.task, episode.demo)
             start = rows[-1]["dataset_to_index"] if rows else 0
+            _check_finite(demo, f"demonstration {episode.demo} of task {episode.task} ({info.name!r})")
             columns = _columns(demo, number, start, said.index(episode.said), fps)
             table = _table(columns, demo)
             where = {"chunk_index": file // _FILES_IN_CHUNK, "file_index": file % _FILES_IN_CHUNK}
@@ -89,8 +90,17 @@ def _episodes(data: DataSet) -> list[Episode]:
                 if not has_action:
                     where = f"demonstration {demo} of task {task} ({info.name!r})"
                     raise ValueError(f"{where}: shows no actions, expected some: LeRobot has no room for that")
-                found.append(Episode(task, demo, info.instructions[demo] if info.instructions else info.name))
+                said = info.instructions[demo] if info.instructions else ""
+                found.append(Episode(task, demo, said or info.name))
+    if not found:
+        raise ValueError(f"{data.folder}: has no demonstrations, expected at least one")
     return found
+
+
+def _check_finite(demo: Demo, where: str) -> None:
+    for field, value in (("state", demo.state), ("action", demo.action)):
+        if value is not None and not np.isfinite(value).all():
+            raise ValueError(f"{where}: {field}: got values that are not finite, expected numbers that JSON can hold")
 
 
 def _cameras(image: Any) -> dict[str, Any]:
@@ -118,8 +128,8 @@ def _table(columns: dict[str, np.ndarray], demo: Demo) -> Any:
             encoded = [{"bytes": _png(image), "path": f"frame-{i:06d}.png"} for i, image in enumerate(value)]
             kind = pyarrow.struct([("bytes", pyarrow.binary()), ("path", pyarrow.string())])
             arrays[name] = pyarrow.array(encoded, kind)
-        elif value.ndim == 1:
-            arrays[name] = pyarrow.array(value)
+        elif value.ndim == 1 or value.shape[1] == 1:  # LeRobot takes vectors with one entry for numbers
+            arrays[name] = pyarrow.array(value.ravel())
         else:
             arrays[name] = pyarrow.FixedSizeListArray.from_arrays(pyarrow.array(value.ravel()), value.shape[1])
     known = {"info": {"features": {name: _feature(value) for name, value in columns.items()}}}
@@ -131,7 +141,9 @@ def _feature(value: np.ndarray) -> dict[str, Any]:
     if value.ndim == 4:
         return {"_type": "Image"}
     one = {"dtype": str(value.dtype), "_type": "Value"}
-    return one if value.ndim == 1 else {"feature": one, "length": value.shape[1], "_type": "List"}
+    return (
+        one if value.ndim == 1 or value.shape[1] == 1 else {"feature": one, "length": value.shape[1], "_type": "List"}
+    )
 
 
 def _png(image: np.ndarray) -> bytes:

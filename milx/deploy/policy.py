@@ -265,9 +265,12 @@ def _check_image(what: str, value: Any, lead: tuple[int, ...], spec: Spec) -> An
         if value is not None:
             raise ValueError(f"{what}.image: got {type(value).__name__}, expected None: this policy sees no pixels")
         return None
-    if isinstance(spec.image_shape, dict) and value is not None and set(by_field(value)) != set(wanted):
+    if value is not None and set(by_field(value)) != set(wanted):
         got = f"the cameras {', '.join(sorted(value))}" if isinstance(value, dict) else type(value).__name__
-        raise ValueError(f"{what}.image: got {got}, expected a dictionary of {', '.join(spec.image_shape)}")
+        several = (
+            f"a dictionary of {', '.join(spec.image_shape)}" if isinstance(spec.image_shape, dict) else "one array"
+        )
+        raise ValueError(f"{what}.image: got {got}, expected {several}")
     checked, given = {}, by_field(value)
     for name, size in wanted.items():
         checked[name] = _check_shape(f"{what}.{name}", given.get(name), (*lead, *size, 3))

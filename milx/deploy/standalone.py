@@ -162,8 +162,11 @@ def _fitted(images: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     if max(1, round(scale * images.shape[-2])) != shape[1]:
         return images
     rows, columns = (_areas(images.shape[axis], size) for axis, size in ((-3, shape[0]), (-2, shape[1])))
-    narrow = _rounded(np.einsum("wx,...yxc->...ywc", columns, images.astype(float), optimize=True))
-    return _rounded(np.einsum("hy,...ywc->...hwc", rows, narrow, optimize=True)).astype(np.uint8)
+    shrunk = np.empty((*images.shape[:-3], *shape, 3), np.uint8)
+    for index in np.ndindex(images.shape[:-3]):
+        narrow = _rounded(np.einsum("wx,yxc->ywc", columns, images[index].astype(float), optimize=True))
+        shrunk[index] = _rounded(np.einsum("hy,ywc->hwc", rows, narrow, optimize=True))
+    return shrunk
 
 
 def _areas(size: int, smaller: int) -> np.ndarray:

@@ -139,7 +139,7 @@ class Run(abc.ABC):
                 return
             if isinstance(network, ConvConfig) and network.fixed_filters not in (None, fixed_filters.KMEANS):
                 fixed_filters.read_filters(network.fixed_filters, network)  # refuses a bad file before planning
-            if config.init is not None:
+            if config.init is not None and latest is None:
                 load(config.init)  # refuses what is not there before planning
             params = self._params_like
             others = self._precompile(params)
@@ -232,7 +232,7 @@ class Run(abc.ABC):
 
     def _start(self, training: Training, checkpoints: Checkpoints) -> tuple[TrainState, jax.Array]:
         """Returns the state to train from, and the key of the batches."""
-        state, batch_key = initial_state(self.trainer, self.config, training)
+        state, batch_key = initial_state(self.trainer, self.config, training, fresh=checkpoints.latest is None)
         if checkpoints.latest is not None:
             state, self.clock.seconds = restore_state(checkpoints, checkpoints.latest, state, training.dataset_hash)
             self.console.print(f"continuing from step {int(state.step)}")

@@ -47,11 +47,16 @@ def check_steps(config: Config) -> None:
             raise ValueError(f"train.{name}: got {value}, expected a positive multiple of train.log_every = {scan}")
 
 
-def initial_state(trainer: Trainer, config: Config, training: Training) -> tuple[TrainState, jax.Array]:
-    """Makes the state before the first meta-update on these demonstrations, and the key of the batches."""
+def initial_state(
+    trainer: Trainer, config: Config, training: Training, fresh: bool = True
+) -> tuple[TrainState, jax.Array]:
+    """Makes the state before the first meta-update on these demonstrations, and the key of the batches.
+
+    Without `fresh` it has only the right shapes, for a run that goes on from a checkpoint.
+    """
     init_key, batch_key = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), 3))
     state = trainer.init(init_key, training.whitening)
-    if config.train.init is not None:
+    if config.train.init is not None and fresh:
         state = dataclasses.replace(state, params=start_from(config.train.init, state.params))
     network = config.network
     if not isinstance(network, ConvConfig) or network.fixed_filters is None:

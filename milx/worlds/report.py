@@ -18,7 +18,7 @@ from milx.deploy.policy import load_run
 from milx.evaluation import provenance
 from milx.evaluation.intervals import wilson_interval
 from milx.evaluation.plots import side_by_side
-from milx.types import by_field
+from milx.networks.policy_network import goal_camera
 from milx.worlds.actor import CONTROLS
 from milx.worlds.evaluate import evaluate_in, tasks_of
 from milx.worlds.slot import Outcome, Task
@@ -63,7 +63,8 @@ def report_on(config: Config, folder: pathlib.Path, make: str, console: Console 
     )
     filmed = [outcome for outcome in outcomes if outcome.images]
     if filmed:
-        first = lambda image: next(iter(by_field(image).values()))  # noqa: E731 - of several cameras
+        camera = goal_camera(policy.spec.image_shape)
+        first = lambda image: image if camera is None else image[camera]  # noqa: E731
         demos = [np.asarray(first(tasks[outcome.episode.task].demos[0].image)) for outcome in filmed]
         trials = [np.stack([first(image) for image in outcome.images or []]) for outcome in filmed]
         longest = max(map(len, demos + trials))

@@ -145,10 +145,11 @@ def _by_field(parts):
     """Makes arrays of an observation's or a demonstration's parts; the only one of a dictionary needs no name."""
     found: dict[str, np.ndarray] = {}
     for name, value in parts.items():
-        several = isinstance(value, dict) and len(value) > 1
-        each = {f"{name}.{key}": one for key, one in value.items()} if several else {name: value}
-        if isinstance(value, dict) and not several:
-            (each[name],) = value.values()
+        if isinstance(value, dict) and (not value or (name != "image" and len(value) > 1)):
+            raise ValueError(f"{name}: has {sorted(value)}, expected an array, or images of several cameras by name")
+        each = {f"{name}.{key}": one for key, one in value.items()} if isinstance(value, dict) else {name: value}
+        if len(each) == 1:
+            each = {name: next(iter(each.values()))}
         found.update((key, np.asarray(one)) for key, one in each.items())
     return found
 

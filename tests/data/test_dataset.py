@@ -134,6 +134,14 @@ def test_zarr_alone_reads_it(written):
     assert np.isnan(group["00002/action"][3:7]).all(), "the demonstration without actions"
 
 
+@pytest.mark.parametrize("instructions", [["one"], "do", ["do", None]])
+def test_instructions_that_nobody_could_read_are_refused_before_anything_is_written(tmp_path, instructions):
+    demo = Demo(None, np.zeros((3, 2)), np.zeros((3, 2)))
+    with pytest.raises(ValueError, match="instructions of 'a': got"), Writer(tmp_path / "set", None, 2, 2) as writer:
+        writer.add("a", "train", [3, 3], [demo, demo], instructions=instructions)
+    assert not (tmp_path / "set").exists()
+
+
 def test_vectors_without_images_and_images_without_vectors(tmp_path):
     for name, sizes in (("vectors", (None, 3, 2)), ("images", ((8, 9), 0, 2))):
         image, state, action = sizes

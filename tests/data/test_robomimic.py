@@ -47,6 +47,20 @@ def test_an_import_is_a_data_set(tmp_path):
             assert np.abs(read.image - halved).max() <= 1
 
 
+def test_an_episode_that_does_not_fit_is_named_or_left_out(copy, tmp_path):
+    """Shortens the actions of one demonstration, and widens the state of another."""
+    replace(copy, "data/demo_1/actions", np.zeros((4, 7)))
+    replace(copy, "data/demo_2/obs/robot0_eef_pos", np.zeros((6, 5)))
+    source = open_set(copy)
+    found = source.episodes("file")
+    assert [episode.name for episode in episodes.readable(found, source.contents)] == ["lift/demo_0", "lift/demo_10"]
+    with pytest.raises(ValueError, match="data/demo_1: got lengths"):
+        episodes.write(tmp_path / "out", found, source.contents, (0.0, 0.0), "there")
+    del found[1]
+    with pytest.raises(ValueError, match=r"state of episode lift/demo_2: got shape \[6, \d+\], expected \[6, "):
+        episodes.write(tmp_path / "out", found, source.contents, (0.0, 0.0), "there")
+
+
 def test_a_single_file_and_a_mapping(tmp_path):
     path = tmp_path / "tasks.json"
     path.write_text('{"lift/demo_0": "a", "lift/demo_1": "b", "lift/demo_2": "a", "lift/demo_10": "b"}')

@@ -93,6 +93,17 @@ def test_statistics_are_those_of_all_episodes(written):
     np.testing.assert_allclose(rows[0]["stats/action/q90"], np.quantile(action, 0.9, axis=0), rtol=1e-6)
 
 
+def test_vectors_of_one_entry_are_numbers_and_who_says_nothing_says_its_task(tmp_path):
+    with Writer(tmp_path / "set", None, 1, 1) as writer:
+        demos = [episodes.Demo(None, np.full((4, 1), i), np.full((4, 1), -i)) for i in range(2)]
+        writer.add("a", "train", [4, 4], demos, instructions=["", "do it"])
+    to_lerobot.write(DataSet(tmp_path / "set"), tmp_path / "out", 10)
+    table = read(tmp_path / "out" / "data/chunk-000/file-000.parquet")
+    assert str(table.schema.field("action").type) == "float"
+    assert table["action"].to_pylist() == [0.0] * 4 + [-1.0] * 4
+    assert read(tmp_path / "out" / "meta/tasks.parquet")["__index_level_0__"].to_pylist() == ["a", "do it"]
+
+
 def test_what_lerobot_has_no_room_for_is_refused(tmp_path):
     with Writer(tmp_path / "set", None, 2, 2) as writer:
         demo = episodes.Demo(None, np.zeros((4, 2)), np.zeros((4, 2)))

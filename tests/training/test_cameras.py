@@ -156,9 +156,10 @@ def test_cameras_that_lack_or_do_not_fit_are_named(policy, demos):
 @pytest.mark.parametrize(
     ("shape", "message"),
     [
-        ({"a/b": (8, 8)}, r"cameras: got the names \['a/b'\], expected letters"),
+        ({"a/b": (8, 8), "c": (8, 8)}, r"cameras: got the names \['a/b'\], expected letters"),
         ({}, "cameras: got the names"),
-        ({"a": (8,)}, r"image.a: got the shape \(8,\), expected two whole numbers"),
+        ({"a": (8, 8)}, r"cameras: got .*, expected \(H, W\): a single camera has no name"),
+        ({"a": (8,), "b": (8, 8)}, r"image.a: got the shape \(8,\), expected two whole numbers"),
     ],
 )
 def test_cameras_without_good_names_or_sizes_are_refused(tmp_path, shape, message):
