@@ -122,6 +122,18 @@ def test_a_run_starts_from_the_parameters_of_another_as_far_as_they_fit(finished
 
 
 @pytest.mark.slow
+def test_a_run_goes_on_when_the_one_it_started_from_is_gone(finished, folder, tmp_path):
+    """Moves the other run away; what has been learned since then is all in the checkpoint."""
+    config, other = tiny_config(folder), shutil.copytree(finished[0].folder, tmp_path / "other")
+    config.train.init, config.train.steps, config.train.eval_every = str(other), 50, 50
+    make_run(config, tmp_path / "run", QUIET).train()
+    other.rename(tmp_path / "moved")
+    config.train.steps = 100
+    make_run(config, tmp_path / "run", QUIET).train()
+    assert read_metrics(tmp_path / "run" / "metrics.jsonl")[-1]["step"] == 100
+
+
+@pytest.mark.slow
 def test_a_run_can_be_extended_and_not_shortened(finished, folder, tmp_path):
     """Goes on to 400 updates: the lines before stay as they are, and the folder is that of the longer run."""
     copy = shutil.copytree(finished[0].folder, tmp_path / "run")

@@ -23,7 +23,7 @@ from milx.deploy.policy import Policy
 from milx.evaluation.intervals import wilson_interval
 from milx.methods.base import Method
 from milx.types import Demo, Spec
-from milx.worlds import report, summarize
+from milx.worlds import report, summarize, worker
 from milx.worlds.actor import CONTROLS, other_tasks
 from milx.worlds.client import Client, WorldError
 from milx.worlds.evaluate import evaluate_in
@@ -294,3 +294,18 @@ def test_lost_episodes_count_as_episodes_without_success():
     console.print(report.table(found))
     assert "[/one]" in console.file.getvalue() and "two\\x1b[31m" in console.file.getvalue()
     assert report.losses(outcomes, tasks) == ["b, own, seed 0: it has ended"]
+
+
+def test_images_of_several_cameras_are_named_and_other_dictionaries_refused():
+    """Asks the process that runs a world what it makes of observations."""
+    image = np.zeros((4, 4, 3), np.uint8)
+    seen = worker._seen({"pixels": {"hand": image, "scene": image + 1}, "agent_pos": [1.0, 2.0]})
+    assert sorted(seen) == ["image.hand", "image.scene", "state"]
+    assert seen["image.scene"].max() == 1
+    assert sorted(worker._seen({"pixels": {"hand": image}})) == ["image"]
+    for observation, message in (
+        ({"agent_pos": {"a": [0.0], "b": [1.0]}}, r"state: has \['a', 'b'\], expected an array"),
+        ({"pixels": {}}, r"image: has \[\], expected an array, or images of several cameras by name"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            worker._seen(observation)
