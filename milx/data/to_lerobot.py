@@ -1,13 +1,14 @@
 """Writes a data set as one of LeRobot's (version 3), with images as PNG: python -m milx.data.to_lerobot SET OUT.
 
-An episode's task is what was said to be done in it, or else the name of its task. `meta/milx_tasks.json` keeps the
-names, so `python -m milx.data.lerobot OUT SET --task=OUT/meta/milx_tasks.json` leads back. The training tasks come
-first, then those for validation and test, as `splits` in `meta/info.json` says.
+An episode's task is what was said to be done in it, or else the name of its task. Names of tasks, splits and families
+are kept in files of `meta/` whose names begin with milx, and the command that leads back with them is printed. The
+training tasks come first, then those for validation and test, as `splits` in `meta/info.json` says.
 """
 
 import io
 import json
 import pathlib
+import shlex
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
@@ -19,6 +20,7 @@ from rich.progress import track
 from milx.core import files
 from milx.core.commands import command
 from milx.data.dataset import DataSet
+from milx.data.header import Header
 from milx.types import SPLITS, Demo, by_field
 
 _DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
@@ -196,6 +198,9 @@ def _write_meta(
     features = dict(_described(data))
     files.write_json(folder / "stats.json", {name: _joined(rows, name) for name in features})
     files.write_json(folder / "milx_tasks.json", names)
+    of_split = lambda split: [head.tasks[task].name for task in head.of_split(split)]  # noqa: E731
+    files.write_json(folder / "milx_splits.json", {split: of_split(split) for split in SPLITS[1:]})
+    files.write_json(folder / "milx_families.json", {task.name: task.family for task in head.tasks})
     ends, splits = 0, {}
     for split in SPLITS:
         count = sum(len(head.tasks[task].lengths) for task in head.of_split(split))
@@ -219,6 +224,18 @@ def _tasks(said: list[str]) -> Any:
     known = {"index_columns": [index], "column_indexes": [], "columns": columns, "pandas_version": "2.0.0"}
     table = pyarrow.table({"task_index": range(len(said)), index: said})
     return table.replace_schema_metadata({"pandas": json.dumps(known)})
+
+
+def way_back(head: Header, out: pathlib.Path) -> str:
+    """Writes the command that imports what `write` has written, with its names, splits and families."""
+    meta, state = out / "meta", "observation.state" if head.state_size else ""
+    words = [f"--camera={','.join(_cameras(head.image_shape))}", f"--state={state}"]
+    kept = {"task": "tasks", "splits": "splits", "family": "families"}
+    words += [f"--{flag}={meta / f'milx_{name}.json'}" for flag, name in kept.items()]
+    words += [f"--height={max((size[0] for size in by_field(head.image_shape).values()), default=1)}"]
+    if head.class_indices:
+        words.append(f"--classes={','.join(map(str, head.class_indices))}")
+    return shlex.join(["python", "-m", "milx.data.lerobot", str(out), "SET", *words])
 
 
 def _described(data: DataSet) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -255,7 +272,9 @@ def main(argv: list[str]) -> None:
         if fps is None:
             raise ValueError("fps: the data set does not say it, expected --fps")
         write(data, pathlib.Path(argv[2]), fps)
-        print(f"{argv[2]}: a LeRobot data set of version 3")
+        print(
+            f"{argv[2]}: a LeRobot data set of version 3; the way back is\n{way_back(data.header, pathlib.Path(argv[2]))}"
+        )
 
 
 if __name__ == "__main__":

@@ -3,7 +3,11 @@
 import dataclasses
 import json
 import pathlib
+import shlex
+import subprocess
+import sys
 
+import jax
 import numpy as np
 import pyarrow.parquet
 import pytest
@@ -91,6 +95,22 @@ def test_statistics_are_those_of_all_episodes(written):
     rows = read(out / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
     action = data.read(data.header.of_split("train")[0], 0).action
     np.testing.assert_allclose(rows[0]["stats/action/q90"], np.quantile(action, 0.9, axis=0), rtol=1e-6)
+
+
+def test_the_command_that_leads_back_does(written, tmp_path):
+    """Runs it, and compares everything but where the demonstrations come from."""
+    data, out = written
+    words = [
+        word if word != "SET" else str(tmp_path / "again")
+        for word in shlex.split(to_lerobot.way_back(data.header, out))
+    ]
+    done = subprocess.run([sys.executable, *words[1:]], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    again = DataSet(tmp_path / "again")
+    assert dataclasses.replace(again.header, source=data.header.source) == data.header
+    for task, info in enumerate(data.header.tasks):
+        for demo in range(len(info.lengths)):
+            jax.tree.map(np.testing.assert_array_equal, again.read(task, demo), data.read(task, demo))
 
 
 def test_vectors_of_one_entry_are_numbers_and_who_says_nothing_says_its_task(tmp_path):
