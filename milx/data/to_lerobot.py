@@ -272,9 +272,8 @@ def main(argv: list[str]) -> None:
         if fps is None:
             raise ValueError("fps: the data set does not say it, expected --fps")
         write(data, pathlib.Path(argv[2]), fps)
-        print(
-            f"{argv[2]}: a LeRobot data set of version 3; the way back is\n{way_back(data.header, pathlib.Path(argv[2]))}"
-        )
+        back = way_back(data.header, pathlib.Path(argv[2]))
+        print(f"{argv[2]}: a LeRobot data set of version 3; the way back is\n{back}")
 
 
 if __name__ == "__main__":

@@ -100,10 +100,8 @@ def test_statistics_are_those_of_all_episodes(written):
 def test_the_command_that_leads_back_does(written, tmp_path):
     """Runs it, and compares everything but where the demonstrations come from."""
     data, out = written
-    words = [
-        word if word != "SET" else str(tmp_path / "again")
-        for word in shlex.split(to_lerobot.way_back(data.header, out))
-    ]
+    command = shlex.split(to_lerobot.way_back(data.header, out))
+    words = [word if word != "SET" else str(tmp_path / "again") for word in command]
     done = subprocess.run([sys.executable, *words[1:]], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     again = DataSet(tmp_path / "again")
