@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from milx.data.dataset import spread
 from milx.deploy.policy import Policy
 from milx.types import Observation, TaskParams
 from milx.worlds.slot import Episode, Outcome, Task
@@ -83,7 +84,8 @@ class Actor:
             if source is None:
                 self._learned[None] = policy.method.unadapted(policy.params)
             else:
-                demos = [policy.prepared(demo) for demo in self._tasks[source].demos]
+                resample = lambda x: np.asarray(x)[:, spread(x.shape[1], policy.horizon)]  # noqa: E731
+                demos = [jax.tree.map(resample, policy.prepared(demo)) for demo in self._tasks[source].demos]
                 shown = jax.tree.map(lambda *parts: np.concatenate(parts), *demos)
                 self._learned[source] = self._adapt(policy.params, shown)
         return self._learned[source]
