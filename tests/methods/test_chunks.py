@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from tiny import QUIET
+from told import Told
 
 import milx
 from milx import methods
@@ -15,7 +16,6 @@ from milx.data.frames import in_chunks
 from milx.data.recorded import read_later
 from milx.deploy import standalone
 from milx.export import export
-from milx.methods.base import Method
 from milx.methods.chunks import FADE, Chunked
 from milx.training import recorded
 from milx.training.factory import make_run
@@ -23,22 +23,6 @@ from milx.types import Demo, Observation, Spec
 
 CHUNK, ACTION = 4, 2
 RNG = np.random.default_rng(0)
-
-
-class Told(Method):
-    """Predicts the chunk that the observation holds."""
-
-    def init(self, key, whitening):
-        raise NotImplementedError
-
-    def loss(self, params, batch, progress=1.0):
-        raise NotImplementedError
-
-    def adapt(self, params, demo):
-        raise NotImplementedError
-
-    def act(self, task_params, observation, memory):
-        return observation.state, memory
 
 
 def executed(execute, plans):

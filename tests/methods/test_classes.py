@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from told import Told
 
 from milx import methods
 from milx.config.assemble import make_config
@@ -13,7 +14,6 @@ from milx.data import episodes
 from milx.data.dataset import DataSet, Writer
 from milx.data.episodes import Contents
 from milx.methods import whitening
-from milx.methods.base import Method
 from milx.methods.chunks import Chunked
 from milx.methods.imitation import behavioral_cloning
 from milx.networks.policy_network import PolicyOutput
@@ -78,22 +78,6 @@ def test_a_policy_does_one_of_the_two_values(name):
     done = np.concatenate(done)
     np.testing.assert_allclose(np.unique(done[:, 1].round(4)), [CLOSED, OPEN], atol=1e-4)
     assert len(np.unique(done[:, 0])) > 200
-
-
-class Told(Method):
-    """Predicts the chunk that the observation holds."""
-
-    def init(self, key, whitening):
-        raise NotImplementedError
-
-    def loss(self, params, batch, progress=1.0):
-        raise NotImplementedError
-
-    def adapt(self, params, demo):
-        raise NotImplementedError
-
-    def act(self, task_params, observation, memory):
-        return observation.state, memory
 
 
 def test_a_mean_over_chunks_leaves_classes_as_the_newest_chunk_says():
