@@ -24,13 +24,13 @@ _SPREAD = 3
 
 def problems(data: DataSet) -> list[str]:
     """Finds what will go wrong, a sentence each, the worst first; reads all states, all actions and first images."""
-    head = data.header
+    head, read = data.header, vectors(data)
     found = [*_refusals(data), *_disappointments(head)]
-    for field, values in vectors(data).items():
+    for field, values in read.items():
         finite = values[np.isfinite(values).all(axis=1)]
         for i in np.flatnonzero(finite.std(axis=0) < MIN_STD).tolist() if len(finite) else ():
             found.append(f"{entry(head, field, i)} is constant: it says nothing")
-    found += _classes(head, vectors(data).get("action", np.zeros((0, head.action_size))))
+    found += _classes(head, read.get("action", np.zeros((0, head.action_size))))
     for number, task in enumerate(head.tasks):
         if head.image_shape is not None and task.lengths:
             seen = data.read(number, 0, np.zeros(1, int), fields=("image",)).image
