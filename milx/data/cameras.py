@@ -59,7 +59,7 @@ def fitted(image: Any, shape: ImageShape) -> Any:
             return image
         return {name: fitted(image[name], size) for name, size in shape.items() if name in image}
     fits = isinstance(image, np.ndarray) and image.dtype == np.uint8 and image.ndim >= 3 and image.shape[-1] == 3
-    if not fits or shrunk(image.shape[-3:], shape[0]) != shape:
+    if not fits or image.shape[-3:-1] == shape or shrunk(image.shape[-3:], shape[0]) != shape:
         return image
     frames = image.reshape(-1, *image.shape[-3:])
     return np.stack(list(resized(frames, shape))).reshape(*image.shape[:-3], *shape, 3)
