@@ -77,6 +77,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "published-small": lambda: _published("", "small"),
     "published-reach": lambda: _published("reach"),
     "published-push": lambda: _published("push"),
+    "published-baselines": lambda: _published("", "baselines"),
     "figure3": lambda: figure3.markdown(list(cells.read(RESULTS / "figure3").values())),
     "figure3-push": lambda: figure3.markdown(list(cells.read(RESULTS / "figure3_push").values())),
     "ablations": lambda: ablations.markdown(cells.read(RESULTS / "ablations"), list(ablations.ABLATIONS), seeds=2),
