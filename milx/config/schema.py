@@ -106,6 +106,8 @@ class ConvConfig:
         filters: output channels of each convolution.
         strides: stride of each convolution.
         kernel: height and width of every kernel.
+        residual_blocks: number of residual blocks after each convolution; each adds two more convolutions, with
+            stride 1, to what comes in (He et al. 2016).
         fixed_filters: source of a first convolution that is never trained: "kmeans" for clusters of patches of the
             training images, or a file with VGG-19's first layer (`milx.networks.fixed_filters`). None for a learned
             first convolution.
@@ -119,6 +121,7 @@ class ConvConfig:
     filters: tuple[int, ...] = number((40, 40, 40), 1, LARGEST_SIZE)
     strides: tuple[int, ...] = number((2, 2, 2), 1, 64)
     kernel: int = number(3, 1, 64)
+    residual_blocks: int = number(0, 0, 64)
     fixed_filters: str | None = None
     mixed_precision: bool = False
     rematerialise: bool = False

@@ -189,7 +189,7 @@ def _sum_over_pixels(x: jax.Array, dtype: jnp.dtype) -> jax.Array:
 
 
 class ConvBlock(nn.Module):
-    """Convolution, bias, layer norm over (H, W, C), ReLU.
+    """Convolution, bias, layer norm over (H, W, C), ReLU; before the ReLU something may be added (He et al. 2016).
 
     Attributes:
         filters: F, output channels.
@@ -204,15 +204,16 @@ class ConvBlock(nn.Module):
     mixed_precision: bool = False
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
-        """Maps [B, H, W, C] to [B, ceil(H / stride), ceil(W / stride), F]."""
+    def __call__(self, x: jax.Array, skip: jax.Array | None = None) -> jax.Array:
+        """Maps [B, H, W, C] to [B, ceil(H / stride), ceil(W / stride), F]; adds `skip`, of that shape."""
         shape = (self.kernel, self.kernel, x.shape[-1], self.filters)
         kernel = self.param("kernel", nn.initializers.lecun_normal(), shape)
         bias = self.param("bias", nn.initializers.zeros, (self.filters,))
         center = self.param("centre", nn.initializers.zeros, (self.filters,))
         dtype = jnp.bfloat16 if self.mixed_precision else kernel.dtype
         x = conv2d(x.astype(dtype), kernel.astype(dtype), self.stride)
-        return shifted_relu(layer_norm(add_bias(x, bias)), center, dtype)
+        x = layer_norm(add_bias(x, bias))
+        return shifted_relu(x if skip is None else x + skip, center, dtype)
 
 
 class FixedConv(nn.Module):

@@ -104,6 +104,12 @@ class ConvStack(nn.Module):
         for i, (filters, stride) in enumerate(zip(config.filters, config.strides, strict=True)):
             layer = FixedConv if i == 0 and config.fixed_filters else block
             x = layer(filters, config.kernel, stride, config.mixed_precision, name=f"ConvBlock_{i}")(x)
+            for j in range(config.residual_blocks):
+                first, second = (
+                    block(filters, config.kernel, 1, config.mixed_precision, name=f"Residual_{i}_{j}_{k}")
+                    for k in range(2)
+                )
+                x = second(first(x), x)
         return x.astype(dtype)
 
 

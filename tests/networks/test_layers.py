@@ -7,7 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from milx.config.schema import ConvConfig
 from milx.networks import layers
+from milx.networks.policy_network import ConvStack
 
 # Convolution.
 
@@ -139,6 +141,27 @@ def test_layer_norm_of_a_constant_image_is_zero_and_has_finite_gradients():
     found, gradient = cubed(np.full((2, 3, 4), 7.0))
     assert found == pytest.approx(2 * 3 * 4)
     assert np.isfinite(gradient).all()
+
+
+def test_residual_blocks_add_two_convolutions_to_their_input(rng):
+    """Compares with lax's convolutions and NumPy's norm, written out."""
+    config = ConvConfig(filters=(4,), strides=(2,), residual_blocks=2)
+    image = rng.integers(0, 256, (3, 8, 6, 3), dtype=np.uint8)
+    stack = ConvStack(config)
+    drawn = stack.init(jax.random.key(0), image, jnp.float64)["params"]
+    params = jax.tree.map(lambda x: x + 0.3 * rng.standard_normal(x.shape), drawn)
+
+    def normalized(x, name, stride=1):
+        x = np.asarray(reference_conv2d(x, params[name]["kernel"], stride)) + params[name]["bias"]
+        deviation = x - x.mean((1, 2, 3), keepdims=True)
+        return deviation / np.sqrt(x.var((1, 2, 3), keepdims=True) + 1e-6) + params[name]["centre"]
+
+    x = np.maximum(normalized(image / 255.0, "ConvBlock_0", 2), 0)
+    for j in range(2):
+        inside = np.maximum(normalized(x, f"Residual_0_{j}_0"), 0)
+        x = np.maximum(x + normalized(inside, f"Residual_0_{j}_1"), 0)
+    np.testing.assert_allclose(stack.apply({"params": params}, image, jnp.float64), x, rtol=1e-9, atol=1e-12)
+    assert len(params) == 5
 
 
 # Bias and center: derivatives of their own, which must be those that JAX finds.
