@@ -197,8 +197,8 @@ class TrainConfig:
     """The meta-training loop.
 
     Attributes:
-        init: a run's folder, or the name of a policy that ships with milx: training starts from its parameters, as far
-            as names and sizes are the same. None to draw all of them.
+        init: where parameters come from: a run's folder, or the name of a policy that ships with milx, as far as names
+            and sizes are the same; or a .safetensors or .npz file (`milx.training.start`). None to draw all of them.
         steps: number of meta-updates.
         meta_batch: tasks in a meta-batch.
         shots: support demonstrations of each task.

@@ -38,6 +38,24 @@ def overlaid(tree: Any, other: Any) -> tuple[Any, list[str]]:
     return jax.tree_util.tree_map_with_path(replace, tree), replaced
 
 
+def read_tensors(path: pathlib.Path) -> dict[str, np.ndarray]:
+    """Reads arrays by name from a .npz or a .safetensors file, which another program may have written.
+
+    Raises:
+        FileError: if it cannot be read, or is a .safetensors file and the package safetensors is missing.
+    """
+    try:
+        if path.suffix == ".npz":
+            return files.read_arrays(path.resolve())
+        from safetensors.numpy import load
+
+        return load(files.read_bytes(path.resolve()))
+    except ImportError as error:
+        raise FileError(f"{path} needs the package safetensors; pip install it") from error
+    except Exception as error:  # safetensors and zipfile raise many types
+        raise FileError(f"{path} cannot be read: {error}") from error
+
+
 def fingerprint(tree: Any) -> str:
     """Computes the SHA-256 hash of the names, types, shapes and contents of all arrays."""
     digest = hashlib.sha256()

@@ -11,7 +11,8 @@ import jax
 import numpy as np
 
 from milx.config.schema import ConvConfig
-from milx.core import files
+from milx.core import pytrees
+from milx.core.files import FileError
 from milx.types import Params
 
 KMEANS = "kmeans"
@@ -49,7 +50,10 @@ def read_filters(path: str, config: ConvConfig) -> Filters:
         raise ValueError(f"network.fixed_filters: got {path!r}, expected {KMEANS!r} or a .npz or .safetensors file")
     if not file.is_file():
         raise ValueError(f"network.fixed_filters: {path} does not exist")
-    arrays = _read(file)
+    try:
+        arrays = pytrees.read_tensors(file)
+    except FileError as error:
+        raise ValueError(f"network.fixed_filters: {error}") from error
     for name, expected in ((_WEIGHT, shape), (_BIAS, shape[:1])):
         if name not in arrays:
             raise ValueError(f"{path}: {name}: missing, expected {expected}; there are {', '.join(sorted(arrays))}")
@@ -59,19 +63,6 @@ def read_filters(path: str, config: ConvConfig) -> Filters:
     scaled = kernel / STD[:, None]
     bias = arrays[_BIAS] - (scaled * MEAN[:, None]).sum(axis=(0, 1, 2))
     return Filters(scaled.astype(np.float32), bias.astype(np.float32))
-
-
-def _read(file: pathlib.Path) -> dict[str, np.ndarray]:
-    try:
-        if file.suffix == ".npz":
-            return files.read_arrays(file.resolve())
-        from safetensors.numpy import load
-
-        return load(files.read_bytes(file.resolve()))
-    except ImportError as error:
-        raise ValueError(f"network.fixed_filters: {file} needs the package safetensors; pip install it") from error
-    except Exception as error:  # safetensors and zipfile raise many types
-        raise ValueError(f"network.fixed_filters: {file} cannot be read: {error}") from error
 
 
 def cluster(images: list[np.ndarray], config: ConvConfig) -> Filters:

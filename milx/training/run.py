@@ -27,12 +27,12 @@ from milx.config.schema import Config, ConvConfig
 from milx.core import files, parallel, progress, signals
 from milx.core.checkpoint import UNVALIDATED, Checkpoints
 from milx.core.messages import printable, say
-from milx.deploy.pretrained import load
 from milx.evaluation import listening, results
 from milx.methods import params_like
 from milx.networks import fixed_filters
 from milx.training import loop
 from milx.training.metrics import MetricsWriter
+from milx.training.start import check_source
 from milx.training.state import Training, check_steps, initial_state, parse_extra, restore_state, save_state
 from milx.training.update import Sample, Trainer, TrainState, compile_in_background, make_optimizer
 from milx.types import Params, Spec
@@ -140,7 +140,7 @@ class Run(abc.ABC):
             if isinstance(network, ConvConfig) and network.fixed_filters not in (None, fixed_filters.KMEANS):
                 fixed_filters.read_filters(network.fixed_filters, network)  # refuses a bad file before planning
             if config.init is not None and latest is None:
-                load(config.init)  # refuses what is not there before planning
+                check_source(config.init)  # refuses what is not there before planning
             params = self._params_like
             others = self._precompile(params)
             compiled = compile_in_background(self.trainer, params, self._shapes(), config.log_every, others)

@@ -8,16 +8,13 @@ import jax
 import numpy as np
 
 from milx.config.schema import Config, ConvConfig
-from milx.core import pytrees
 from milx.core.checkpoint import UNVALIDATED, Checkpoints
 from milx.core.files import FileError
-from milx.core.messages import say
-from milx.deploy.pretrained import load
 from milx.evaluation import provenance
 from milx.methods.whitening import Whitening
 from milx.networks import fixed_filters
+from milx.training.start import start_from
 from milx.training.update import Trainer, TrainState
-from milx.types import Params
 
 PARTS = ("demos", "compile", "train", "evaluate", "total")
 """The parts of a run whose seconds are counted."""
@@ -66,28 +63,6 @@ def initial_state(
     else:
         filters = fixed_filters.read_filters(network.fixed_filters, network)
     return dataclasses.replace(state, params=fixed_filters.put(state.params, filters)), batch_key
-
-
-def start_from(run: str, params: Params) -> Params:
-    """Replaces parameters by those of a trained policy that have the same names and sizes; the whitening stays.
-
-    Args:
-        run: as `milx.load` takes it.
-        params: what a method has drawn.
-
-    Raises:
-        ValueError: if there is no such policy, or it has nothing in common with these parameters.
-    """
-    theirs = {name: part for name, part in load(run).params.items() if name != "whitening"}
-    started, names = pytrees.overlaid(params, theirs)
-    learned = [name for name in pytrees.leaves(params) if not name.startswith("whitening")]
-    if not names:
-        expected = "a policy with parameters of the same names and sizes: the same method and a similar network"
-        raise ValueError(
-            f"init: got {run!r}, which has none of the {len(learned)} parameters here, expected {expected}"
-        )
-    say(f"{len(names)} of {len(learned)} parameters start from {run}; all others are drawn")
-    return started
 
 
 def save_state(

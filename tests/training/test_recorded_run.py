@@ -31,7 +31,7 @@ from milx.training import recorded
 from milx.training.factory import make_run
 from milx.training.metrics import MetricsWriter, read_metrics
 from milx.training.recorded import RecordedRun
-from milx.training.state import start_from
+from milx.training.start import start_from
 from milx.types import Demo
 
 HORIZON = 8
