@@ -210,6 +210,7 @@ class TrainConfig:
             its demonstrations new positions. A few planned demonstrations then stand for many tasks and scenes.
         log_every: meta-updates in one scan on the device; metrics are logged after every scan.
         eval_every: meta-updates between two validations, each with a checkpoint.
+        wandb: a project in Weights & Biases that metrics are sent to, too (`milx.training.tracking`); None for none.
     """
 
     init: str | None = None
@@ -222,6 +223,7 @@ class TrainConfig:
     redraw: bool = False
     log_every: int = 100
     eval_every: int = 2000
+    wandb: str | None = None
 
 
 @dataclasses.dataclass

@@ -1,4 +1,4 @@
-"""What training writes down as it goes: metrics.jsonl, and events for TensorBoard."""
+"""What training writes down as it goes: metrics.jsonl, events for TensorBoard, and what is handed to wandb."""
 
 import contextlib
 import json
@@ -13,21 +13,29 @@ from tensorboardX.proto.event_pb2 import Event, SessionLog
 
 from milx.core import files
 from milx.core.files import FileError
+from milx.training.tracking import Tracker
 
 
 class MetricsWriter:
     """Writes numbers to metrics.jsonl and to TensorBoard events.
 
     Both are written before `write` returns, without threads or queues. What cannot be written, for example on a full
-    disk, is reported and left out; TensorBoard's file, once it has failed, is not written any more.
+    disk, is reported and left out; TensorBoard's file and wandb, once they have failed, are not tried any more.
 
     Args:
         folder: the run's.
         step: where the run continues; lines after it are from before an interruption and are dropped.
         warn: told of what cannot be written.
+        track: starts to send metrics elsewhere, too; None for nowhere.
     """
 
-    def __init__(self, folder: pathlib.Path, step: int, warn: Callable[[str], None]):
+    def __init__(
+        self,
+        folder: pathlib.Path,
+        step: int,
+        warn: Callable[[str], None],
+        track: Callable[[], Tracker] | None = None,
+    ):
         self._warn, self._path = warn, folder / "metrics.jsonl"
         self._events: EventsWriter | None = None
         lines = [line for line in read_metrics(self._path) if line["step"] <= step] if self._path.is_file() else []
@@ -39,11 +47,20 @@ class MetricsWriter:
             self._events.write_event(
                 Event(step=step + 1, wall_time=time.time(), session_log=SessionLog(status=SessionLog.START))
             )
+        self._tracker: Tracker | None = None
+        if track is not None:
+            with self._reported("wandb's metrics", (Exception,)):
+                self._tracker = track()
 
     def write(self, step: int, values: dict[str, float]) -> None:
         """Writes one line."""
         with self._reported(f"metrics of step {step}"):
             files.append(self._path, json.dumps({"step": step, **values}) + "\n")
+        if self._tracker is not None:
+            tracker, self._tracker = self._tracker, None  # unless all goes well
+            with self._reported("wandb's metrics", (Exception,)):
+                tracker.log(step, values)
+                self._tracker = tracker
         if self._events is None:
             return
         events, self._events = self._events, None  # unless all goes well
@@ -54,16 +71,19 @@ class MetricsWriter:
             self._events = events
 
     def close(self) -> None:
-        """Closes TensorBoard's file."""
+        """Closes TensorBoard's file, and waits for wandb."""
+        if self._tracker is not None:
+            with self._reported("wandb's metrics", (Exception,)):
+                self._tracker.close()
         if self._events is not None:
             with self._reported("TensorBoard's events"):
                 self._events.close()
 
     @contextlib.contextmanager
-    def _reported(self, what: str) -> Iterator[None]:
+    def _reported(self, what: str, errors: tuple[type[Exception], ...] = (FileError, OSError)) -> Iterator[None]:
         try:
             yield
-        except (FileError, OSError) as error:
+        except errors as error:
             self._warn(f"{what} could not be written: {error}")
 
 

@@ -11,6 +11,7 @@ learning_curve.png
 
 import abc
 import contextlib
+import functools
 import pathlib
 import tempfile
 from collections.abc import Callable
@@ -34,6 +35,7 @@ from milx.training import loop
 from milx.training.metrics import MetricsWriter
 from milx.training.start import check_source
 from milx.training.state import Training, check_steps, initial_state, parse_extra, restore_state, save_state
+from milx.training.tracking import Tracker
 from milx.training.update import Sample, Trainer, TrainState, compile_in_background, make_optimizer
 from milx.types import Params, Spec
 
@@ -148,7 +150,9 @@ class Run(abc.ABC):
             state, key = self._start(training, checkpoints)
             with self.clock("compile"), self.phase("compiling the training program"):
                 scan = compiled.result()
-            metrics = MetricsWriter(self.folder, int(state.step), self._warn)
+            is_tracked = config.wandb is not None and parallel.is_first_host()
+            track = functools.partial(Tracker, self.folder, self.config) if is_tracked else None
+            metrics = MetricsWriter(self.folder, int(state.step), self._warn, track)
             with contextlib.closing(metrics), self.phase("meta-training", config.steps, int(state.step)):
                 hooks = self._hooks(metrics, training.dataset_hash)
                 state = loop.fit(scan, state, key, training, config, checkpoints, hooks, self.clock, stop)
@@ -239,7 +243,7 @@ class Run(abc.ABC):
         return state, batch_key
 
     def _claim_folder(self, extend: bool = False) -> None:
-        """Writes the configuration, or checks that the folder's is the same but for more updates and _ANYWHERE.
+        """Writes the configuration, or checks that the folder's is the same but for more updates, wandb and _ANYWHERE.
 
         Args:
             extend: whether to write these.
@@ -254,6 +258,7 @@ class Run(abc.ABC):
         if mine["train"]["steps"] > theirs["train"]["steps"]:
             theirs["train"]["steps"] = mine["train"]["steps"]
         theirs["evaluation"] |= {name: mine["evaluation"][name] for name in _ANYWHERE}
+        theirs["train"]["wandb"] = mine["train"]["wandb"]
         if changed := assemble.differences(theirs, mine):
             raise ValueError(f"workdir: {self.folder} holds another run: {'; '.join(changed)}")
         if extend and assemble.flatten(mine) != before:

@@ -1,0 +1,60 @@
+"""Metrics in Weights & Biases, without a network."""
+
+import re
+import sys
+import time
+
+import pytest
+
+from milx.config.assemble import make_config
+from milx.training.metrics import MetricsWriter, read_metrics
+from milx.training.tracking import Tracker
+
+
+@pytest.fixture
+def tracker(tmp_path, monkeypatch):
+    """Makes what starts a tracker whose files stay in the folder."""
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    monkeypatch.setenv("WANDB_SILENT", "true")
+    config = make_config("reach")
+    config.train.wandb = "milx-tests"
+    return lambda: Tracker(tmp_path, config)
+
+
+def test_a_run_that_goes_on_hands_all_its_lines_to_the_same_run_of_wandb(tmp_path, tracker):
+    reports = []
+    for first in (1, 2):
+        writer = MetricsWriter(tmp_path, first - 1, reports.append, tracker)
+        for step in range(first, first + 2):
+            writer.write(step, {"loss": 1.0 / (1 << step)})
+        writer.close()
+        time.sleep(1.1)  # the names of wandb's folders have seconds
+    assert not reports
+    logs = sorted((tmp_path / "wandb").glob("offline-run-*/run-*.wandb"))
+    assert len({path.name for path in logs}) == 1
+    values = [re.findall(rb"loss\W{1,8}(0\.\d+)", path.read_bytes()) for path in logs]
+    found = [[float(value) for value in dict.fromkeys(each)] for each in values]  # they are there twice
+    assert found == [[0.5, 0.25], [0.25, 0.125]]
+
+
+def test_without_wandb_training_goes_on(tmp_path, tracker, monkeypatch):
+    reports = []
+    monkeypatch.setitem(sys.modules, "wandb", None)  # as if it were not installed
+    writer = MetricsWriter(tmp_path, 0, reports.append, tracker)
+    for step in (1, 2):
+        writer.write(step, {"loss": 0.5})
+    writer.close()
+    assert len(reports) == 1
+    assert reports[0].startswith("wandb's metrics could not be written: import of wandb")
+    assert [line["step"] for line in read_metrics(tmp_path / "metrics.jsonl")] == [1, 2]
+
+
+def test_a_failure_of_wandb_is_reported_once(tmp_path, tracker):
+    reports = []
+    writer = MetricsWriter(tmp_path, 0, reports.append, tracker)
+    assert writer._tracker is not None
+    writer._tracker._run.finish()  # so that it takes no more
+    for step in (1, 2):
+        writer.write(step, {"loss": 0.5})
+    writer.close()
+    assert [report.partition(": ")[0] for report in reports] == ["wandb's metrics could not be written"]
