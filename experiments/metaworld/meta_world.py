@@ -28,7 +28,10 @@ STEPS = 200
 PIXELS = 64
 EYE, TARGET, FIELD = (0.85, 0.3, 0.62), (0.02, 0.72, 0.16), 42.0
 """Where the camera is (m), what it looks at, and its field of view (degrees): the table, seen over a corner of it."""
+PLACES = 100
+"""Places of object and goal where a task is a whole family; demonstrations have as many others."""
 _AFTER, _WANDER = 5, 8
+_DEMONSTRATION = {"demonstration": True}
 
 
 def tasks() -> list[str]:
@@ -42,18 +45,25 @@ def make(task: str) -> gymnasium.Env:
     return MetaWorld(family, int(number))
 
 
-@functools.lru_cache(maxsize=2)
+@functools.lru_cache(maxsize=4)
 def _benchmark(family: str, seed: int) -> metaworld.ML1:
     return metaworld.ML1(family, seed=seed)
 
 
 class MetaWorld(gymnasium.Env):
-    """One task. Observations are "image", uint8 [64, 64, 3], and "state", the hand's position (m) and opening [4]."""
+    """One family. Observations are "image", uint8 [64, 64, 3], and "state", the hand's position (m) and opening [4].
 
-    def __init__(self, family: str, number: int):
-        benchmark = _benchmark(family, number // 50)
-        self._env = benchmark.train_classes[family]()
-        self._env.set_task(benchmark.train_tasks[number % 50])
+    Args:
+        family: as Meta-World calls it.
+        number: the place of object and goal; None for another one whenever an episode or a demonstration begins, of
+            `PLACES` each, which the seed chooses.
+        steps: time steps of an episode.
+    """
+
+    def __init__(self, family: str, number: int | None, steps: int = STEPS):
+        self._family, self._number, self._length = family, number, steps
+        self._env = _benchmark(family, 0).train_classes[family]()
+        self._put(number or 0)
         self._expert = ENV_POLICY_MAP[family]()
         self.action_space = self._env.action_space
         self.observation_space = gymnasium.spaces.Dict(
@@ -62,13 +72,20 @@ class MetaWorld(gymnasium.Env):
                 "state": gymnasium.spaces.Box(-np.inf, np.inf, (4,), np.float64),
             }
         )
-        self._colors = _colors(self._env.model)
         self._seen: np.ndarray = np.zeros(39)
         self._steps = 0
+
+    def _put(self, number: int) -> None:
+        benchmark = _benchmark(self._family, number // 50)
+        self._env.set_task(benchmark.train_tasks[number % 50])
+        self._colors = _colors(self._env.model)
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[dict, dict]:
         """Starts an episode: the hand wanders for some steps, so that no two are the same."""
         super().reset(seed=seed)
+        if self._number is None:
+            shift = PLACES if options == _DEMONSTRATION else 0
+            self._put(shift + (int(self.np_random.integers(PLACES)) if seed is None else seed % PLACES))
         self._seen, _ = self._env.reset(seed=seed)
         drift = self.np_random.uniform(-1, 1, 4)
         for _ in range(_WANDER):
@@ -81,7 +98,7 @@ class MetaWorld(gymnasium.Env):
         self._seen, reward, *_, info = self._env.step(action)
         self._steps += 1
         success = bool(info["success"])
-        return self._observation(), float(reward), False, self._steps >= STEPS, {"is_success": success}
+        return self._observation(), float(reward), False, self._steps >= self._length, {"is_success": success}
 
     def demonstrate(self, seed: int) -> dict[str, np.ndarray]:
         """Lets the scripted policy do the task, with some noise.
@@ -89,12 +106,12 @@ class MetaWorld(gymnasium.Env):
         Raises:
             RuntimeError: if it does not succeed.
         """
-        observation, _ = self.reset(seed=seed)
+        observation, _ = self.reset(seed=seed, options=_DEMONSTRATION)
         shown: dict[str, list] = {"image": [], "state": [], "action": []}
         left = None
         while left != 0:
-            if self._steps >= STEPS:
-                raise RuntimeError(f"the scripted policy has not succeeded within {STEPS} steps")
+            if self._steps >= self._length:
+                raise RuntimeError(f"the scripted policy has not succeeded within {self._length} steps")
             knowing = np.append(self._seen[:36], self._env._target_pos)  # the last three are hidden from policies
             action = self._expert.get_action(knowing) + self.np_random.normal(0, 0.05, 4)
             action = np.clip(action, -1, 1).astype(np.float32)
