@@ -1,4 +1,4 @@
-"""What training writes down as it goes: metrics.jsonl, events for TensorBoard, and what is handed to wandb."""
+"""What training writes down as it goes: metrics.jsonl, events for TensorBoard, and Weights & Biases."""
 
 import contextlib
 import json

@@ -142,7 +142,7 @@ class Run(abc.ABC):
             if isinstance(network, ConvConfig) and network.fixed_filters not in (None, fixed_filters.KMEANS):
                 fixed_filters.read_filters(network.fixed_filters, network)  # refuses a bad file before planning
             if config.init is not None and latest is None:
-                check_source(config.init)  # refuses what is not there before planning
+                check_source(config.init, self._params_like)  # refuses what is not there before planning
             params = self._params_like
             others = self._precompile(params)
             compiled = compile_in_background(self.trainer, params, self._shapes(), config.log_every, others)

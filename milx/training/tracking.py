@@ -1,11 +1,17 @@
 """Metrics in Weights & Biases (wandb), beside those in the run's folder."""
 
-import hashlib
 import pathlib
+import secrets
 from typing import Any
 
 from milx.config import assemble
 from milx.config.schema import Config
+from milx.core import files
+
+_ID = "wandb_id"
+"""The file in the run's folder with the name by which wandb knows the run."""
+_PATIENCE = 60
+"""Seconds that wandb may take to log in, or to send what is left."""
 
 
 class Tracker:
@@ -25,14 +31,21 @@ class Tracker:
     def __init__(self, folder: pathlib.Path, config: Config):
         import wandb
 
+        path = folder / _ID
+        if not path.is_file():
+            files.write_bytes(path, secrets.token_hex(8).encode())
+        settings = wandb.Settings(
+            console="off", login_timeout=_PATIENCE, finish_timeout=_PATIENCE, finish_timeout_raises=True
+        )
         self._run: Any = wandb.init(
             project=config.train.wandb,
             name=folder.name,
-            id=hashlib.sha256(str(folder.resolve()).encode()).hexdigest()[:16],
+            id=files.read_bytes(path).decode(),
             resume="allow",
+            reinit="create_new",  # one that somebody else has begun in this process stays theirs
             dir=str(folder),
             config=assemble.to_dict(config),
-            settings=wandb.Settings(console="off"),
+            settings=settings,
         )
         self._run.define_metric("*", step_metric="step")  # steps may come a second time in a run that goes on
 
@@ -41,5 +54,5 @@ class Tracker:
         self._run.log({"step": step, **values})
 
     def close(self) -> None:
-        """Waits until everything is sent."""
+        """Waits until everything is sent, for a minute at most."""
         self._run.finish()

@@ -58,3 +58,17 @@ def test_a_failure_of_wandb_is_reported_once(tmp_path, tracker):
         writer.write(step, {"loss": 0.5})
     writer.close()
     assert [report.partition(": ")[0] for report in reports] == ["wandb's metrics could not be written"]
+
+
+def test_a_run_that_somebody_else_has_begun_stays_theirs(tmp_path, tracker):
+    import wandb
+
+    theirs, reports = wandb.init(project="theirs", dir=str(tmp_path)), []
+    writer = MetricsWriter(tmp_path, 0, reports.append, tracker)
+    writer.write(1, {"loss": 0.5})
+    writer.close()
+    theirs.log({"mine": 0.125})
+    assert theirs.summary["mine"] == 0.125
+    assert theirs.summary.get("loss") is None
+    theirs.finish()
+    assert not reports
