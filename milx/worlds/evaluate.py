@@ -15,6 +15,9 @@ from milx.worlds.actor import CONTROLS, Actor
 from milx.worlds.client import Client, WorldError
 from milx.worlds.slot import Episode, Outcome, Slot, Task
 
+FIRST_SEED = 1_000_000
+"""Of the episodes, unless another is chosen."""
+
 
 def tasks_of(data: DataSet, split: str, policy: Policy) -> list[Task]:
     """Lists the tasks of a split that have as many demonstrations as the policy's run was evaluated with.
@@ -46,7 +49,7 @@ def evaluate_in(
     *,
     controls: Sequence[str] = tuple(CONTROLS),
     episodes: int = 10,
-    seed: int = 0,
+    seed: int = FIRST_SEED,
     workers: int = 4,
     python: str = sys.executable,
     timeout: float = 60.0,
@@ -62,7 +65,8 @@ def evaluate_in(
         controls: keys of CONTROLS; those that a task does not have, for example because there is no other family, are
             left out.
         episodes: of every task and control, with the seeds `seed`, `seed` + 1 and so on, the same for all controls.
-        seed: of the first episode. The world demonstrates with the seed before, modulo 2^31.
+        seed: of the first episode, by default far from those of `milx.worlds.record`, which begin at 0: an episode must
+            not start where its demonstration did. The world demonstrates with the seed before, modulo 2^31.
         workers: processes at once.
         python: the interpreter that runs the world.
         timeout: seconds that a world may take to answer. One that has not answered is ended, and its episode lost.
