@@ -71,19 +71,16 @@ def judged(config: Config, folder: pathlib.Path, python: str, workers: int, epis
 def markdown(found: dict[str, dict[str, Any]]) -> str:
     """Writes a table of what there is: success at any time, over all tasks and by family, after what was shown."""
     families = sorted({family for run in found.values() for family in run["world"]["controls"]["own"]["families"]})
-    lines = [
-        "| | after | success (95%) | at the end | " + " | ".join(name.removesuffix("-v3") for name in families) + " |",
-        "|---|---|---|---|" + "---|" * len(families),
-    ]
+    header = ["", "after", "success (95%)", "at the end", "episodes", *(name.removesuffix("-v3") for name in families)]
+    lines = [f"| {' | '.join(header)} |", "|---" * len(header) + "|"]
     for name, run in found.items():
         label, seed = ROWS[name.rpartition("-")[0]][0], name.rpartition("-")[2]
         for control, rates in run["world"]["controls"].items():
             low, high = rates["ever_wilson95"]
-            each = " | ".join(f"{rates['families'][family]['ever']:.0%}" for family in families)
-            lines.append(
-                f"| {label}, seed {seed} | {CONTROLS[control]} | {rates['ever']:.1%} ({low:.0%} to {high:.0%}) "
-                f"| {rates['end']:.1%} | {each} |"
-            )
+            columns = [f"{label}, seed {seed}", CONTROLS[control], f"{rates['ever']:.1%} ({low:.0%} to {high:.0%})"]
+            columns += [f"{rates['end']:.1%}", str(rates["episodes"])]
+            columns += [f"{rates['families'][family]['ever']:.0%}" for family in families]
+            lines.append(f"| {' | '.join(columns)} |")
     return "\n".join(lines)
 
 
@@ -95,6 +92,8 @@ def read() -> dict[str, dict[str, Any]]:
 def main(argv: list[str]) -> None:
     """Runs what is missing and prints the table."""
     milx.configure()
+    if not _SHOW.value and len(argv) != 2:
+        raise app.UsageError("expected one argument, SET")
     for row in [] if _SHOW.value else _ROWS.value:
         for seed in range(_SEEDS.value):
             config, name = configure(row, argv[1], seed), f"{row}-{seed}"
@@ -112,7 +111,7 @@ def main(argv: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    _ROWS = flags.DEFINE_list("rows", list(ROWS), "Which policies.")
+    _ROWS = flags.DEFINE_multi_enum("rows", list(ROWS), list(ROWS), "Which policies; may be repeated.")
     _SEEDS = flags.DEFINE_integer("seeds", 1, "Seeds of each.")
     _RUNS = flags.DEFINE_string("runs", "runs", "The folder of the runs.")
     _PYTHON = flags.DEFINE_string("python", None, "The interpreter that runs Meta-World; none to train only.")

@@ -24,7 +24,8 @@ from absl import app
 ROOT = pathlib.Path(__file__).parents[2]
 RESULTS = ROOT / "experiments" / "results"
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs" / "results").glob("*.md"))]
-sys.path.insert(0, str(ROOT / "experiments" / "benchmarks"))
+sys.path[:0] = [str(ROOT / "experiments" / folder) for folder in ("benchmarks", "metaworld")]
+import board  # noqa: E402
 import summary  # noqa: E402
 
 
@@ -81,6 +82,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "figure3": lambda: figure3.markdown(list(cells.read(RESULTS / "figure3").values())),
     "figure3-push": lambda: figure3.markdown(list(cells.read(RESULTS / "figure3_push").values())),
     "ablations": lambda: ablations.markdown(cells.read(RESULTS / "ablations"), list(ablations.ABLATIONS), seeds=2),
+    "meta-world": lambda: board.markdown(board.read()),
     "benchmarks": lambda: summary.table(list(cells.read(RESULTS / "benchmarks").values())),
 }
 """What makes the table of each name."""
