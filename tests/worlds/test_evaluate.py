@@ -121,6 +121,15 @@ def test_episodes_end_as_they_do_one_after_the_other(policy):
     assert rate["replay"] > rate["other_family"] == rate["same_family"] == rate["unadapted"] == 0
 
 
+def test_no_episode_starts_where_a_recorded_demonstration_did(policy):
+    """Compares with the starts of as many demonstrations as `milx.worlds.record` could make in vain and not."""
+    outcomes = evaluate_in(policy, "point_world:make", TASKS[:1], controls=["mean_action"], episodes=5)
+    world = point_world.PointWorld(TASKS[0].name)
+    starts = np.stack([world.reset(seed=outcome.episode.seed)[0] for outcome in outcomes])
+    recorded = np.stack([world.demonstrate(seed)["state"][0] for seed in range(50)])
+    assert np.linalg.norm(starts[:, None] - recorded[None], axis=-1).min() > 1e-6
+
+
 def test_worlds_that_fail_cost_their_episodes_and_are_reported(policy):
     began = time.monotonic()
     demo = Demo(state=np.ones((6, 2)), action=np.zeros((6, 2)))
