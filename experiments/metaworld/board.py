@@ -47,6 +47,10 @@ ROWS: dict[str, tuple[str, str, dict[str, Any]]] = {
         _CONTEXTUAL | {"network.filters": (64,) * 4, "optimizer.name": "muon"},
     ),
     "lstm": ("LSTM", "lstm", {"network.strides": (2, 1, 2, 1), "network.context": 256}),
+    "mil-longer": ("MIL, 20,000 updates", "mil", _MIL | {"train.steps": 20_000, "train.eval_every": 10_000}),
+    "mil-coarse": ("MIL, strides 2, 2, 2, 1", "mil", _MIL | {"network.strides": (2, 2, 2, 1)}),
+    "mil-one-action": ("MIL, no chunks", "mil", _MIL | {"method.chunk": 1}),
+    "mil-few-frames": ("MIL, 4 and 8 time steps", "mil", _MIL | {"train.support_frames": 4, "train.query_frames": 8}),
 }
 """Policies by name: what the table calls them, the method, and what else differs."""
 
