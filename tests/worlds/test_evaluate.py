@@ -139,6 +139,7 @@ def test_worlds_that_fail_cost_their_episodes_and_are_reported(policy):
         [Task("near/right", "near", (demo,))],
         controls=["own"],
         episodes=6,
+        seed=0,
         workers=2,
         timeout=3.0,
     )
@@ -232,7 +233,7 @@ def test_larger_pictures_are_shrunk_and_other_ones_refused(policy):
     tasks = [Task("near/left", "near", (demo,))]
     seeing = dataclasses.replace(policy, spec=spec, method=Watcher())
     (outcome,) = evaluate_in(
-        seeing, "point_world:make_pictured_well", tasks, controls=["own"], episodes=1, workers=1, film=1
+        seeing, "point_world:make_pictured_well", tasks, controls=["own"], episodes=1, seed=0, workers=1, film=1
     )
     world = point_world.Pictured("near/left")
     picture = world.reset(seed=0)[0]["pixels"]
