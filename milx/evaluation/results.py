@@ -6,6 +6,9 @@ from milx.config import assemble
 from milx.config.schema import Config
 from milx.evaluation import provenance
 
+_PLACES = ("recorded.path", "train.wandb")
+"""Fields that say where data are or metrics go: they make no other variant."""
+
 
 def compose(
     config: Config, found: dict[str, Any], seconds: dict[str, float], step: int, dataset_hash: str
@@ -19,11 +22,12 @@ def compose(
         step: meta-updates of the checkpoint that was evaluated.
         dataset_hash: `fingerprint` of the training demonstrations.
     """
+    changed = {name: value for name, value in assemble.overrides(config).items() if name not in _PLACES}
     return {
         "env": config.env_name,
         "method": config.method_name,
         "preset": config.preset,
-        "variant": ", ".join(f"{name}={value}" for name, value in assemble.overrides(config).items()),
+        "variant": ", ".join(f"{name}={value}" for name, value in changed.items()),
         "seed": config.seed,
         **found,
         "wall_clock_s": seconds,

@@ -5,6 +5,7 @@ checkpoints/            the latest and the best by validation
 metrics.jsonl           one line for every log and validation; events.* hold the same for TensorBoard
 evaluation.json         the result on held-out tasks
 learning_curve.png
+wandb_id, wandb/        of Weights & Biases, if `train.wandb` asks for it
 
 `milx.training.simulated` and `milx.training.recorded` say where demonstrations come from and how a policy is judged.
 """

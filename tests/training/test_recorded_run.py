@@ -87,6 +87,8 @@ def test_held_out_tasks_are_learned_from_their_demonstration(finished):
     assert errors["after"] < 0.4 * errors["before"]
     assert errors["other_task"] > errors["mean_action"]
     assert result["score"] == pytest.approx(1 - errors["after"] / errors["mean_action"])
+    assert "network.filters=(4, 4)" in result["variant"]
+    assert "recorded.path" not in result["variant"]
     lines = [json.loads(line) for line in (run.folder / "metrics.jsonl").open()]
     scores = [line["validation_score"] for line in lines if "validation_score" in line]
     assert len(scores) == 3
