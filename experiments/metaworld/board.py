@@ -37,20 +37,28 @@ _GOAL_HEAD = {"network.goal_head": True, "method.goal_weight": 1.0, "recorded.go
 _MIL = _FINE | {"train.support_frames": 10, "train.steps": 10_000, "train.eval_every": 5000}
 _CONTEXTUAL = _FINE | {"network.context": 64}
 ROWS: dict[str, tuple[str, str, dict[str, Any]]] = {
-    "mil": ("MIL + learned rates", "mil", _MIL),
-    "mil-goal": ("MIL + learned rates, goal head", "mil", _MIL | _GOAL_HEAD),
-    "contextual": ("contextual", "contextual", _CONTEXTUAL),
-    "contextual-goal": ("contextual + goal head", "contextual", _CONTEXTUAL | _GOAL_HEAD),
+    "mil": ("MIL + learned rates, chunks", "mil", _MIL),
+    "mil-goal": ("MIL + learned rates, chunks, goal head", "mil", _MIL | _GOAL_HEAD),
+    "contextual": ("contextual + chunks", "contextual", _CONTEXTUAL),
+    "contextual-goal": ("contextual + chunks, goal head", "contextual", _CONTEXTUAL | _GOAL_HEAD),
     "contextual-wide": (
-        "contextual, 64 filters, Muon",
+        "contextual + chunks, 64 filters, Muon",
         "contextual",
         _CONTEXTUAL | {"network.filters": (64,) * 4, "optimizer.name": "muon"},
     ),
-    "lstm": ("LSTM", "lstm", {"network.strides": (2, 1, 2, 1), "network.context": 256}),
-    "mil-longer": ("MIL, 20,000 updates", "mil", _MIL | {"train.steps": 20_000, "train.eval_every": 10_000}),
-    "mil-coarse": ("MIL, strides 2, 2, 2, 1", "mil", _MIL | {"network.strides": (2, 2, 2, 1)}),
-    "mil-one-action": ("MIL, no chunks", "mil", _MIL | {"method.chunk": 1}),
-    "mil-few-frames": ("MIL, 4 and 8 time steps", "mil", _MIL | {"train.support_frames": 4, "train.query_frames": 8}),
+    "lstm": ("LSTM + chunks", "lstm", {"network.strides": (2, 1, 2, 1), "network.context": 256}),
+    "mil-longer": (
+        "MIL + learned rates, chunks; 20,000 updates",
+        "mil",
+        _MIL | {"train.steps": 20_000, "train.eval_every": 10_000},
+    ),
+    "mil-coarse": ("MIL + learned rates, chunks; strides 2, 2, 2, 1", "mil", _MIL | {"network.strides": (2, 2, 2, 1)}),
+    "mil-one-action": ("MIL + learned rates", "mil", _MIL | {"method.chunk": 1}),
+    "mil-few-frames": (
+        "MIL + learned rates, chunks; 4 and 8 time steps",
+        "mil",
+        _MIL | {"train.support_frames": 4, "train.query_frames": 8},
+    ),
 }
 """Policies by name: what the table calls them, the method, and what else differs."""
 

@@ -57,6 +57,6 @@ def test_the_table_has_a_line_for_each_control():
     lines = board.markdown({"mil-7": {"world": {"controls": controls}}}).splitlines()
     assert lines[0] == "|  | after | success (95%) | at the end | episodes | push | reach |"
     assert lines[1] == "|---" * 7 + "|"
-    label = "MIL + learned rates, seed 7"
+    label = "MIL + learned rates, chunks, seed 7"
     assert lines[2] == f"| {label} | its own demonstration | 75.0% (65% to 85%) | 25.0% | 8 | 75% | 100% |"
     assert lines[3] == f"| {label} | random actions | 12.5% (2% to 22%) | 25.0% | 8 | 12% | 100% |"
