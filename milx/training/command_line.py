@@ -40,7 +40,12 @@ def define_flags(values: flags.FlagValues = FLAGS) -> None:
         "(smaller images and networks; the default without an accelerator). --config.path.to.field=value changes any "
         "of them.",
     )
-    string("init", None, "A run's folder, or a policy that ships with milx, whose parameters training starts from.")
+    string(
+        "init",
+        None,
+        "Whose parameters training starts from: a run's folder, a policy that ships with milx, or a .safetensors or .npz "
+        "file.",
+    )
     integer("seed", 0, "Seed of training tasks, initial parameters and batches.", lower_bound=0)
     string("coordinator", None, "Several hosts outside SLURM and Cloud TPU: address:port of the first one.")
     integer("num_processes", None, "With --coordinator: how many hosts there are.", lower_bound=1)
