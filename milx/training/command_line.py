@@ -43,8 +43,8 @@ def define_flags(values: flags.FlagValues = FLAGS) -> None:
     string(
         "init",
         None,
-        "Whose parameters training starts from: a run's folder, a policy that ships with milx, or a .safetensors or .npz "
-        "file.",
+        "Where parameters come from at the start: a run's folder, a policy that ships with milx, or a .safetensors or "
+        ".npz file.",
     )
     integer("seed", 0, "Seed of training tasks, initial parameters and batches.", lower_bound=0)
     string("coordinator", None, "Several hosts outside SLURM and Cloud TPU: address:port of the first one.")
