@@ -9,8 +9,13 @@ from PIL import Image
 from milx.types import ImageShape
 
 
+def name_of(source: str) -> str:
+    """Names a camera by the last part of its source, without "_image"."""
+    return source.rpartition(".")[2].removesuffix("_image")
+
+
 def named(sources: str) -> dict[str, str]:
-    """Names the cameras of sources that are separated by commas, by their last part without "_image".
+    """Names the cameras of sources that are separated by commas, as `name_of` does.
 
     Returns:
         The sources by name; a single one has the name "".
@@ -21,7 +26,7 @@ def named(sources: str) -> dict[str, str]:
     listed = [source for source in sources.split(",") if source]
     if len(listed) == 1:
         return {"": listed[0]}
-    names = [source.rpartition(".")[2].removesuffix("_image") for source in listed]
+    names = [name_of(source) for source in listed]
     if len(set(names)) < len(names) or not all(names):
         raise ValueError(f"camera: got {sources}, which are called {', '.join(names)}; expected different names")
     return dict(zip(names, listed, strict=True))
