@@ -220,8 +220,8 @@ def agree(policy, demo, worlds, batches):
 @pytest.mark.lerobot
 def test_lerobot_s_loop_does_what_milx_does(policy, demos, worlds):
     """Evaluates two batches of episodes, with LeRobot's own processors that change nothing."""
-    from lerobot.policies.factory import policy_action_to_transition, transition_to_policy_action
     from lerobot.processor import DeviceProcessorStep, PolicyProcessorPipeline
+    from lerobot.processor.converters import policy_action_to_transition, transition_to_policy_action
     from lerobot.scripts.lerobot_eval import eval_policy
 
     from milx.deploy.lerobot import LeRobotPolicy
