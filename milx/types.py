@@ -194,9 +194,10 @@ def is_image(field: str) -> bool:
     return field.partition(".")[0] == "image"
 
 
-def black(shape: ImageShape, lead: tuple[int, ...] = ()) -> Any:
-    """Makes black images [*lead, H, W, 3] of these sizes; None without any."""
-    return from_fields({name: np.zeros((*lead, *size, 3), np.uint8) for name, size in by_field(shape).items()})
+def black(shape: ImageShape, lead: tuple[int, ...] = (), history: int = 1) -> Any:
+    """Makes black images [*lead, H, W, 3 N] of these sizes, N = `history` side by side; None without any."""
+    channels = 3 * history
+    return from_fields({name: np.zeros((*lead, *size, channels), np.uint8) for name, size in by_field(shape).items()})
 
 
 def is_image_shape(value: Any) -> bool:

@@ -21,8 +21,9 @@ def check_config(config: Config) -> None:
         ValueError: if a value is not allowed; the message names the field, its value and what was expected.
     """
     _check_group(config, "")
-    if config.method.chunk > 1 and not config.recorded.path:
-        raise ValueError(f"method.chunk: got {config.method.chunk}, expected 1 in simulation")
+    for field, value in (("method.chunk", config.method.chunk), ("recorded.history", config.recorded.history)):
+        if value > 1 and not config.recorded.path:
+            raise ValueError(f"{field}: got {value}, expected 1 in simulation")
     network = config.network
     if isinstance(network, ConvConfig) and len(network.filters) != len(network.strides):
         expected = f"as many as network.filters = {network.filters}"

@@ -71,6 +71,9 @@ class RecordedConfig:
             values at the end of the demonstration.
         gib: device memory, in GiB, for the demonstrations from which one scan of meta-updates samples its batches.
             While a scan runs, the next scan's demonstrations are loaded, which can take as much memory again.
+        history: number of observations that the policy sees at every time step: the latest one and those of the
+            recording's time steps before it; the first of an episode stands for those before it
+            (`milx.methods.history`). Images take so many times the memory.
         shift: maximum number of pixels by which the images of a demonstration are moved at random in training.
         recolor: maximum relative change of the brightness of each of their channels in training.
     """
@@ -79,6 +82,7 @@ class RecordedConfig:
     horizon: int = number(50, 1, 100_000)
     goal_indices: tuple[int, ...] = number((), 0, 100_000)
     gib: float = number(2.0, 0, 100_000)
+    history: int = number(1, 1, 100)
     shift: int = number(0, 0, 1000)
     recolor: float = number(0.0, 0, 1)
 

@@ -10,7 +10,7 @@ def augmented(image: Any, key: jax.Array, shift: int, recolor: float) -> Any:
     """Changes the images of a demonstration, all of one camera alike.
 
     Args:
-        image: [T, H, W, 3] uint8; of several cameras a dictionary by name, None for none.
+        image: [T, H, W, 3 N] uint8, N images side by side; of several cameras a dictionary by name, None for none.
         key: draws the changes, others for every camera.
         shift: the largest number of pixels by which images are moved down and to the right, or up and to the left; the
             pixels at the edge are repeated (Yarats, Kostrikov and Fergus 2021).
@@ -30,5 +30,5 @@ def _one_camera(image: jax.Array, key: jax.Array, shift: int, recolor: float) ->
         image = jax.lax.dynamic_slice(padded, (0, y, x, 0), image.shape)
     if recolor:
         factor = jax.random.uniform(color_key, (3,), minval=1 - recolor, maxval=1 + recolor)
-        image = jnp.clip(jnp.round(image * factor), 0, 255).astype(jnp.uint8)
+        image = jnp.clip(jnp.round(image * jnp.tile(factor, image.shape[-1] // 3)), 0, 255).astype(jnp.uint8)
     return image

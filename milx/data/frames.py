@@ -12,6 +12,11 @@ def next_frames(frames: np.ndarray, length: int, chunk: int) -> np.ndarray:
     return np.minimum(frames[:, None] + np.arange(chunk), length - 1)
 
 
+def previous_frames(frames: np.ndarray, history: int) -> np.ndarray:
+    """Lists for each of these time steps [T] itself and those before it, [T, history]; the first one is repeated."""
+    return np.maximum(frames[:, None] - np.arange(history), 0)
+
+
 def in_chunks(action: Array, chunk: int) -> Array:
     """Puts actions [..., T, A] of the next time steps side by side, [..., T, chunk A]; the last one is repeated."""
     length = action.shape[-2]

@@ -11,8 +11,9 @@ import numpy as np
 
 from milx.data.augment import augmented
 from milx.data.dataset import ALL_FIELDS, DataSet, spread
-from milx.data.frames import frame_indices, next_frames
+from milx.data.frames import frame_indices, next_frames, previous_frames
 from milx.data.goals import with_goals
+from milx.methods.history import side_by_side
 from milx.types import Array, Demo, TaskBatch, by_field, from_fields
 
 MOST_DEMOS = 16
@@ -38,38 +39,55 @@ class Recorded:
 
 
 def read_later(
-    data: DataSet, task: int, demo: int, horizon: int, chunk: int, fields: tuple[str, ...] = ALL_FIELDS
+    data: DataSet,
+    task: int,
+    demo: int,
+    horizon: int,
+    chunk: int = 1,
+    history: int = 1,
+    fields: tuple[str, ...] = ALL_FIELDS,
 ) -> Callable[[], Demo]:
     """Starts reading a demonstration, resampled to T = `horizon` steps; the result is a function that waits for it.
 
-    Its actions [T, chunk A] are those of the next `chunk` time steps before it was resampled.
+    Its actions [T, chunk A] are those of the next `chunk` time steps before it was resampled; its images
+    [T, H, W, 3 history] and states [T, history S] are those of the `history` time steps that end there, the latest
+    first.
     """
     length = data.header.tasks[task].lengths[demo]
     frames = spread(length, horizon)
-    seen = data.read_later(task, demo, frames, tuple(field for field in fields if field != "action"))
+    fields = tuple(field for field in fields if field != "action")
+    seen = data.read_later(task, demo, previous_frames(frames, history).ravel(), fields)
     done = data.read_later(task, demo, next_frames(frames, length, chunk).ravel(), ("action",))
 
     def finish() -> Demo:
-        action = done().action
-        shaped = None if action is None else action.reshape(horizon, -1)
-        return dataclasses.replace(seen(), action=shaped)
+        action, observed = done().action, seen()
+        several = jax.tree.map(lambda x: x.reshape(horizon, history, *x.shape[1:]), (observed.image, observed.state))
+        return Demo(*side_by_side(*several), None if action is None else action.reshape(horizon, -1))
 
     return finish
 
 
-def shape_of(data: DataSet, num_tasks: int, num_demos: int, horizon: int, chunk: int) -> Recorded:
+def shape_of(data: DataSet, num_tasks: int, num_demos: int, horizon: int, chunk: int, history: int) -> Recorded:
     """Returns shapes and types of `read_demos`'s result."""
     lead, head = (num_tasks, num_demos, horizon), data.header
     shapes = by_field(head.image_shape)
-    image = from_fields({name: jax.ShapeDtypeStruct((*lead, *size, 3), np.uint8) for name, size in shapes.items()})
-    sizes = head.state_size, chunk * head.action_size
+    channels = 3 * history
+    image = from_fields(
+        {name: jax.ShapeDtypeStruct((*lead, *size, channels), np.uint8) for name, size in shapes.items()}
+    )
+    sizes = history * head.state_size, chunk * head.action_size
     state, action = (jax.ShapeDtypeStruct((*lead, size), np.float32) for size in sizes)
     which = jax.ShapeDtypeStruct(lead[:2], np.bool_)
     return Recorded(jax.ShapeDtypeStruct((num_tasks,), np.int32), Demo(image, state, action), which, which)
 
 
 def read_demos(
-    data: DataSet, tasks: Sequence[int], demos: Sequence[Sequence[int]], horizon: int, chunk: int = 1
+    data: DataSet,
+    tasks: Sequence[int],
+    demos: Sequence[Sequence[int]],
+    horizon: int,
+    chunk: int = 1,
+    history: int = 1,
 ) -> Recorded:
     """Reads demonstrations, all at once, as NumPy arrays.
 
@@ -79,14 +97,15 @@ def read_demos(
         demos: the numbers of the demonstrations of each; D is the most of them.
         horizon: T.
         chunk: time steps whose actions stand side by side.
+        history: time steps whose observations do.
     """
-    like = shape_of(data, len(tasks), max(len(chosen) for chosen in demos), horizon, chunk)
+    like = shape_of(data, len(tasks), max(len(chosen) for chosen in demos), horizon, chunk, history)
     whole = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), like)
     whole.number[:] = tasks
     pending = []
     for n, (task, chosen) in enumerate(zip(tasks, demos, strict=True)):
         for d, number in enumerate(chosen):
-            pending.append((n, d, read_later(data, task, number, horizon, chunk)))
+            pending.append((n, d, read_later(data, task, number, horizon, chunk, history)))
     for n, d, finish in pending:
         demo = finish()
         whole.there[n, d], whole.acts[n, d] = True, demo.action is not None
@@ -168,19 +187,28 @@ class Shards:
         seed: draws the shards.
         acting: at least so many demonstrations of a task that show actions are in a shard, if it has as many.
         chunk: time steps whose actions stand side by side.
+        history: time steps whose observations do.
 
     Raises:
         ValueError: if not even one task fits.
     """
 
     def __init__(
-        self, data: DataSet, tasks: Sequence[int], horizon: int, gib: float, seed: int, acting: int, chunk: int = 1
+        self,
+        data: DataSet,
+        tasks: Sequence[int],
+        horizon: int,
+        gib: float,
+        seed: int,
+        acting: int,
+        chunk: int = 1,
+        history: int = 1,
     ):
-        self.data, self.tasks, self.horizon, self.seed = data, list(tasks), horizon, seed
-        self.acting, self.chunk = acting, chunk
+        self.data, self.tasks, self.seed, self.acting = data, list(tasks), seed, acting
+        self._sizes = horizon, chunk, history
         most = max(len(data.header.tasks[i].lengths) for i in self.tasks)
         self.num_demos = min(most, MOST_DEMOS)
-        one = shape_of(data, 1, self.num_demos, horizon, chunk)
+        one = shape_of(data, 1, self.num_demos, *self._sizes)
         of_task = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(one))
         if of_task > gib * 2**30:
             raise ValueError(f"recorded.gib: got {gib}, expected at least {of_task / 2**30:.3g}, the size of a task")
@@ -192,7 +220,7 @@ class Shards:
     @functools.cached_property
     def shapes(self) -> Recorded:
         """Shapes and types of a shard."""
-        return shape_of(self.data, self.num_tasks, self.num_demos, self.horizon, self.chunk)
+        return shape_of(self.data, self.num_tasks, self.num_demos, *self._sizes)
 
     def at(self, scan: int) -> Recorded:
         """Returns the shard of a scan, and begins to read the next one's."""
@@ -206,7 +234,7 @@ class Shards:
 
     def _load(self, scan: int) -> Recorded:
         tasks, demos = self.chosen(scan)
-        loaded = read_demos(self.data, tasks, demos, self.horizon, self.chunk)
+        loaded = read_demos(self.data, tasks, demos, *self._sizes)
         fill = self.num_demos - loaded.there.shape[1]  # as large as every shard
         pad = lambda x: np.pad(x, [(0, 0), (0, fill)] + [(0, 0)] * (x.ndim - 2)) if x.ndim > 1 else x  # noqa: E731
         return jax.device_put(jax.tree.map(pad, loaded))

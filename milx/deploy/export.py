@@ -74,6 +74,7 @@ def export(policy: Policy, out: str | pathlib.Path, shots: int = 1) -> None:
     arrays = {f"{i:04d}": np.asarray(leaf) for i, leaf in enumerate(leaves)}
     arrays |= {f"memory{i:04d}": np.asarray(leaf) for i, leaf in enumerate(memory)}
     header = {"format": standalone.FORMAT, "inputs": sizes, "chunk": policy.config.method.chunk}
+    header["history"] = policy.config.recorded.history
     header["metadata"] = {name: getattr(policy.spec, name) for name in ("fps", "state_names", "action_names")}
     with files.creating(folder) as partial:
         for name, program in programs.items():
@@ -89,7 +90,8 @@ def input_shapes(policy: Policy, shots: int) -> dict[str, dict[str, list[int]]]:
     spec, config = policy.spec, policy.config
     seen = {"state": [spec.state_size]} if spec.state_size else {}
     seen |= {name: [*size, 3] for name, size in by_field(spec.image_shape).items()}
-    shown = seen | {"action": [config.method.chunk * spec.action_size]}
+    shown = {name: [*size, config.recorded.history * each] for name, (*size, each) in seen.items()}
+    shown["action"] = [config.method.chunk * spec.action_size]
     hidden: tuple[str, ...] = {GIVEN[0]: (), GIVEN[1]: ("action",), GIVEN[2]: ("action", "state")}[config.method.given]
     adapt = {name: [shots, policy.horizon, *shape] for name, shape in shown.items() if name not in hidden}
     return {"adapt": adapt, "act": seen}

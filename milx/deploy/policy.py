@@ -17,9 +17,10 @@ from milx.core.checkpoint import Checkpoints
 from milx.core.files import FileError
 from milx.data.cameras import fitted
 from milx.data.dataset import spread
-from milx.data.frames import in_chunks
+from milx.data.frames import in_chunks, previous_frames
 from milx.data.goals import with_goals
 from milx.methods import Method
+from milx.methods.history import side_by_side
 from milx.types import SPEC_FILE, Array, Demo, Memory, Observation, Params, Spec, TaskParams, by_field, from_fields
 
 
@@ -75,7 +76,11 @@ class Policy:
             demo = dataclasses.replace(demo, action=in_chunks(demo.action, self.config.method.chunk))
         if not self.config.recorded.path:
             return demo
-        return jax.tree.map(lambda x: x[:, spread(x.shape[1], self.horizon)], demo)
+        frames = spread(jax.tree.leaves(demo)[0].shape[1], self.horizon)
+        before = previous_frames(frames, self.config.recorded.history)
+        image, state = side_by_side(*jax.tree.map(lambda x: x[:, before], (demo.image, demo.state)))
+        rest = jax.tree.map(lambda x: x[:, frames], dataclasses.replace(demo, image=None, state=None))
+        return dataclasses.replace(rest, image=image, state=state)
 
     def act(self, task_params: TaskParams, observation: Observation) -> jax.Array:
         """Returns the action [A], in the environment's units, for one observation; the computation is jitted.
@@ -88,7 +93,7 @@ class Policy:
                 a memory, which needs `step`.
         """
         if jax.tree.leaves(self.initial_memory):
-            raise ValueError("memory: missing, expected `Policy.step`: this policy remembers what it saw first")
+            raise ValueError("memory: missing, expected `Policy.step`: this policy remembers what it saw before")
         return self.step(task_params, observation, self.initial_memory)[0]
 
     def step(self, task_params: TaskParams, observation: Observation, memory: Memory) -> tuple[jax.Array, Memory]:

@@ -33,6 +33,7 @@ class Policy:
         sizes: the shapes of the inputs, by field: [K, T, ...] for "adapt" and [...] for "act".
         metadata: "fps", "state_names" and "action_names" of the demonstrations, as far as they are known.
         chunk: the number of time steps whose actions "adapt" takes side by side, and the policy predicts at once.
+        history: the number of time steps whose observations "adapt" takes side by side, and the policy sees at once.
         params: the learned parameters.
         initial_memory: the memory at the start of an episode; empty for most policies.
 
@@ -43,7 +44,9 @@ class Policy:
     def __init__(self, folder: str | os.PathLike):
         folder = pathlib.Path(folder)
         header = _read_header(folder / "policy.json")
-        self.sizes, digests, self.chunk = (header[name] for name in ("inputs", "sha256", "chunk"))
+        self.sizes, digests, self.chunk, self.history = (
+            header[name] for name in ("inputs", "sha256", "chunk", "history")
+        )
         self.metadata = header.get("metadata", {})
         names = ("params.npz", "adapt.bin", "act.bin")
         params, *programs = (_read(folder / name, digests.get(name)) for name in names)
@@ -73,19 +76,19 @@ class Policy:
             ValueError: for a field that is missing, not expected, or has a wrong shape or type, a value that is not
                 finite, or another number of demonstrations than the policy was exported for.
         """
-        wanted, values, lengths = dict(self.sizes["adapt"]), {}, {}
-        if "action" in wanted:
-            wanted["action"] = [*wanted["action"][:-1], wanted["action"][-1] // self.chunk]
+        values, lengths = {}, {}
+        together = {name: self.chunk if name == "action" else self.history for name in self.sizes["adapt"]}
+        wanted = {name: [*size, each // together[name]] for name, (*size, each) in self.sizes["adapt"].items()}
         for name, value in self._checked(demo, wanted, lead=2).items():
             value = value.reshape(-1, *value.shape[-len(wanted[name]) + 1 :])
             shots, steps = wanted[name][:2]
             if len(value) != shots:
                 raise ValueError(f"{name}: got {len(value)} demonstrations, expected {shots}")
-            if name == "action":
-                after = np.arange(value.shape[1])[:, None] + np.arange(self.chunk)
-                value = value[:, np.minimum(after, value.shape[1] - 1)].reshape(*value.shape[:2], -1)
-            values[name] = value[:, np.linspace(0, value.shape[1] - 1, steps).round().astype(int)]
             lengths[name] = value.shape[1]
+            frames = np.linspace(0, value.shape[1] - 1, steps).round().astype(int)[:, None]
+            others = np.arange(together[name]) * (1 if name == "action" else -1)  # the next ones, or those before
+            several = value[:, np.clip(frames + others, 0, value.shape[1] - 1)]
+            values[name] = np.moveaxis(several, 2, -2).reshape(*self.sizes["adapt"][name])
         if len(set(lengths.values())) > 1:
             raise ValueError(f"time steps: got {lengths}, expected the same of all fields")
         return self._adapt(self.params, values)
@@ -104,7 +107,7 @@ class Policy:
                 finite, also in the action. Also if the policy has a memory, which needs `step`.
         """
         if self.initial_memory:
-            raise ValueError("memory: missing, expected `step`: this policy remembers what it saw first")
+            raise ValueError("memory: missing, expected `step`: this policy remembers what it saw before")
         return self.step(task_params, self.initial_memory, **observation)[0]
 
     def step(
@@ -196,7 +199,7 @@ def _check_inputs(path: pathlib.Path, name: str, fields: dict, takes: tuple, aft
 
 
 def _read_header(path: pathlib.Path) -> dict:
-    """Reads the shapes of the inputs, the SHA-256 of the other files by name, the length of a chunk, and metadata."""
+    """Reads the shapes of the inputs, the SHA-256 of the other files, lengths of chunk and history, and metadata."""
     try:
         values = json.loads(_content(path))
         if values["format"] != FORMAT:
@@ -206,10 +209,11 @@ def _read_header(path: pathlib.Path) -> dict:
             raise ValueError(f"inputs: got {inputs!r:.100}, expected the fields of adapt and of act")
         if not isinstance(digests, dict):
             raise ValueError(f"sha256: got {digests!r:.100}, expected hashes by the names of files")
-        chunk = values.get("chunk", 1)
-        if type(chunk) is not int or chunk < 1:
-            raise ValueError(f"chunk: got {chunk!r:.100}, expected a whole number, at least 1")
-        return values | {"chunk": chunk}
+        lengths = {name: values.get(name, 1) for name in ("chunk", "history")}
+        for name, length in lengths.items():
+            if type(length) is not int or length < 1:
+                raise ValueError(f"{name}: got {length!r:.100}, expected a whole number, at least 1")
+        return values | lengths
     except (KeyError, TypeError, ValueError, RecursionError) as error:
         raise ValueError(f"{path}: expected what the export of a policy writes: {error!r:.200}") from error
 

@@ -10,6 +10,7 @@ from milx.config.schema import GIVEN, Config, ConvConfig
 from milx.methods.base import Method
 from milx.methods.chunks import Chunked
 from milx.methods.contextual import make_contextual, make_lstm, make_lstm_attention
+from milx.methods.history import History
 from milx.methods.mil import MILConfig, make_mil
 from milx.methods.whitening import Whitening
 from milx.networks.attention import AttentionConfig
@@ -49,12 +50,23 @@ def make(config: Config, spec: Spec) -> Method:
     fixed = config.network.fixed_filters if isinstance(config.network, ConvConfig) else None
     if fixed is not None and spec.image_shape is None:
         raise ValueError(f"network.fixed_filters: got {fixed!r}, expected None: this policy sees no pixels")
+    history = config.recorded.history
+    if fixed is not None and history > 1:
+        expects = f"None: its filters see one image, and the policy recorded.history = {history} at once"
+        raise ValueError(f"network.fixed_filters: got {fixed!r}, expected {expects}")
     chunk, execute = config.method.chunk, config.method.execute
     if execute > chunk:
         raise ValueError(f"method.execute: got {execute}, expected at most method.chunk = {chunk}")
-    whole = dataclasses.replace(spec, action_size=chunk * spec.action_size, class_indices=classes(config, spec))
+    whole = dataclasses.replace(
+        spec,
+        state_size=history * spec.state_size,
+        action_size=chunk * spec.action_size,
+        class_indices=classes(config, spec),
+    )
     method = entry.make(config, whole)
     assert isinstance(method, Method)
+    if history > 1:
+        method = History(method, history, spec.image_shape, spec.state_size)
     return method if chunk == 1 else Chunked(method, chunk, execute, spec.action_size, spec.class_indices)
 
 
@@ -65,6 +77,6 @@ def classes(config: Config, spec: Spec) -> tuple[int, ...]:
 
 def params_like(method: Method, spec: Spec) -> Params:
     """Returns shapes and types of a method's parameters."""
-    sizes = spec.state_size, method.chunk * spec.action_size
+    sizes = method.history * spec.state_size, method.chunk * spec.action_size
     state, action = (jax.ShapeDtypeStruct((size,), np.float32) for size in sizes)
     return jax.eval_shape(method.init, jax.random.key(0), Whitening(state, state, action, action))

@@ -1,6 +1,7 @@
 """The interface of every method: trainer, evaluator and users know nothing else."""
 
 import abc
+import dataclasses
 
 import jax
 
@@ -16,10 +17,12 @@ class Method(abc.ABC):
 
     chunk = 1
     """C, the number of time steps whose actions demonstrations hold for each of theirs, one after the other."""
+    history = 1
+    """N, the number of observations that demonstrations hold for each of their time steps, the latest first."""
 
     @property
     def predictor(self) -> "Method":
-        """The method that predicts what demonstrations hold, and not what is executed of it; itself without chunks."""
+        """The method that sees and predicts what demonstrations hold: itself without chunks and without a history."""
         return self
 
     @property
@@ -65,3 +68,46 @@ class Method(abc.ABC):
         """Returns the memory at the start of an episode; `key` is for methods that act at random."""
         del key
         return ()
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Wrapper(Method):
+    """A method that learns as another one does, and differs from it in how it acts.
+
+    Attributes:
+        method: the other one.
+    """
+
+    method: Method
+
+    @property
+    def predictor(self) -> Method:
+        """As the method's."""
+        return self.method.predictor
+
+    @property
+    def imitation_steps(self) -> int:
+        """As the method's."""
+        return self.method.imitation_steps
+
+    def init(self, key: jax.Array, whitening: Whitening) -> Params:
+        """As the method's, with the whitening of what demonstrations hold."""
+        return self.method.init(key, whitening)
+
+    def loss(
+        self, params: Params, batch: TaskBatch, progress: jax.Array | float = 1.0
+    ) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """As the method's."""
+        return self.method.loss(params, batch, progress)
+
+    def imitation(self, params: Params, batch: TaskBatch) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """As the method's."""
+        return self.method.imitation(params, batch)
+
+    def adapt(self, params: Params, demo: Demo) -> TaskParams:
+        """As the method's."""
+        return self.method.adapt(params, demo)
+
+    def unadapted(self, params: Params) -> TaskParams | None:
+        """As the method's."""
+        return self.method.unadapted(params)

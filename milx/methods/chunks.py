@@ -5,16 +5,15 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from milx.methods.base import Method
-from milx.methods.whitening import Whitening
-from milx.types import Demo, Memory, Observation, Params, TaskBatch, TaskParams
+from milx.methods.base import Wrapper
+from milx.types import Memory, Observation, TaskParams
 
 FADE = 0.01
 """By which the logarithm of a prediction's weight falls with every time step that it is younger (Zhao et al. 2023)."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Chunked(Method):
+class Chunked(Wrapper):
     """A method that predicts chunks [C A] in the place of actions [A], and how they are executed.
 
     At time step t the policy has the chunks p_t, p_{t-1}, .., p_{t-C+1}, of which p_{t-i} says p_{t-i}[i] of this step.
@@ -30,43 +29,15 @@ class Chunked(Method):
         class_indices: entries of the action that take two values.
     """
 
-    method: Method
     chunk: int = dataclasses.field()  # without the default of the class above
     execute: int
     action_size: int
     class_indices: tuple[int, ...] = ()
 
     @property
-    def predictor(self) -> Method:
-        """The method whose actions are whole chunks."""
-        return self.method
-
-    @property
-    def imitation_steps(self) -> int:
+    def history(self) -> int:  # type: ignore[override]
         """As the method's."""
-        return self.method.imitation_steps
-
-    def init(self, key: jax.Array, whitening: Whitening) -> Params:
-        """As the method's, with the whitening of chunks."""
-        return self.method.init(key, whitening)
-
-    def loss(
-        self, params: Params, batch: TaskBatch, progress: jax.Array | float = 1.0
-    ) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """As the method's, of demonstrations with chunks."""
-        return self.method.loss(params, batch, progress)
-
-    def imitation(self, params: Params, batch: TaskBatch) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """As the method's, of demonstrations with chunks."""
-        return self.method.imitation(params, batch)
-
-    def adapt(self, params: Params, demo: Demo) -> TaskParams:
-        """As the method's, to demonstrations with chunks."""
-        return self.method.adapt(params, demo)
-
-    def unadapted(self, params: Params) -> TaskParams | None:
-        """As the method's."""
-        return self.method.unadapted(params)
+        return self.method.history
 
     def act(self, task_params: TaskParams, observation: Observation, memory: Memory) -> tuple[jax.Array, Memory]:
         """Predicts a chunk and executes; the memory holds the last C chunks, the time step, and the method's memory."""

@@ -92,14 +92,16 @@ class ContextPolicy(Method):
 def make_contextual(config: Config, spec: Spec) -> ContextPolicy:
     """Builds the policy that sees a demonstration's last frame."""
     assert isinstance(config.network, ContextConfig)
-    network = make_context_network(LastFrame(config.network), _actor(config.network, spec), spec)
+    parts = LastFrame(config.network), _actor(config.network, spec)
+    network = make_context_network(*parts, spec, config.recorded.history)
     return _with_context(config, spec, network)
 
 
 def make_lstm(config: Config, spec: Spec) -> ContextPolicy:
     """Builds the policy whose LSTM reads a demonstration."""
     assert isinstance(config.network, RecurrentConfig)
-    network = make_context_network(Recurrent(config.network), _actor(config.network, spec), spec)
+    parts = Recurrent(config.network), _actor(config.network, spec)
+    network = make_context_network(*parts, spec, config.recorded.history)
     return _with_context(config, spec, network)
 
 

@@ -294,7 +294,8 @@ def make_mil(config: Config, spec: Spec) -> MIL:
     assert isinstance(network, PolicyConfig) and isinstance(settings, MILConfig)
     _check_variant(settings, network, config.train.steps)
     _check_inner_loss(settings, network, has_goal_head=bool(network.goal_head and spec.goal_indices))
-    policy = make_policy(network, spec.image_shape, spec.state_size, spec.action_size, len(spec.goal_indices))
+    sizes = spec.image_shape, spec.state_size, spec.action_size, len(spec.goal_indices)
+    policy = make_policy(network, *sizes, config.recorded.history)
     return MIL(settings, policy, spec.goal_indices, calibration(config, spec), spec.class_indices)
 
 

@@ -119,17 +119,18 @@ class Actor(nn.Module):
         return controller(features, state, jnp.broadcast_to(context, (len(state), *context.shape)), query)
 
 
-def make_context_network(encoder: nn.Module, actor: nn.Module, spec: Spec) -> ContextNetwork:
+def make_context_network(encoder: nn.Module, actor: nn.Module, spec: Spec, history: int = 1) -> ContextNetwork:
     """Joins an encoder and an actor.
 
     Args:
         encoder: maps demonstrations to contexts.
         actor: maps contexts and observations to actions.
         spec: sizes of observations and actions.
+        history: N, images of a camera that are side by side in the channels.
     """
 
     def init(key: jax.Array) -> Params:
-        image = black(spec.image_shape, (1,))
+        image = black(spec.image_shape, (1,), history)
         state, action = jnp.zeros((1, spec.state_size)), jnp.zeros((1, spec.action_size))
         encoder_key, actor_key = jax.random.split(key)
         context, encoding = encoder.init_with_output(encoder_key, image, state, action)

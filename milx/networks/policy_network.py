@@ -241,7 +241,12 @@ class _Policy(nn.Module):
 
 
 def make_policy(
-    config: PolicyConfig, image_shape: ImageShape, state_size: int, action_size: int, goal_size: int
+    config: PolicyConfig,
+    image_shape: ImageShape,
+    state_size: int,
+    action_size: int,
+    goal_size: int,
+    history: int = 1,
 ) -> PolicyNetwork:
     """Builds the policy network.
 
@@ -252,9 +257,10 @@ def make_policy(
         state_size: S.
         action_size: A.
         goal_size: G, entries of the state that the goal head predicts.
+        history: N, images of a camera that are side by side in the channels.
     """
     module = _Policy(config, action_size, goal_size, goal_camera(image_shape))
-    image = black(image_shape, (1,))
+    image = black(image_shape, (1,), history)
 
     loss, head = LearnedLoss(config.learned_loss or "linear"), HindsightHead(goal_size)
 

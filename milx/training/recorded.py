@@ -82,7 +82,7 @@ class Statistics(NamedTuple):
     action: np.ndarray
 
 
-def read_vectors(data: DataSet, tasks: list[int], horizon: int, chunk: int = 1) -> Statistics:
+def read_vectors(data: DataSet, tasks: list[int], horizon: int, chunk: int = 1, history: int = 1) -> Statistics:
     """Reads all states and actions of these tasks, resampled to the horizon.
 
     Args:
@@ -90,6 +90,7 @@ def read_vectors(data: DataSet, tasks: list[int], horizon: int, chunk: int = 1) 
         tasks: numbers of the tasks.
         horizon: time steps to which each demonstration is resampled.
         chunk: time steps whose actions stand side by side.
+        history: time steps whose states do.
 
     Returns:
         The states of all demonstrations, and the actions of those that show them.
@@ -101,7 +102,7 @@ def read_vectors(data: DataSet, tasks: list[int], horizon: int, chunk: int = 1) 
     for task in tasks:
         info = data.header.tasks[task]
         for number in range(len(info.lengths)):
-            demo = read_later(data, task, number, horizon, chunk, ("state",))()
+            demo = read_later(data, task, number, horizon, chunk, history, ("state",))()
             for field, value in (("state", demo.state), ("action", demo.action)):
                 if value is not None and not (np.abs(value) <= LARGEST).all():
                     where = f"demonstration {number} of task {task} ({info.name!r})"
@@ -152,8 +153,8 @@ class RecordedRun(Run):
                 f"at least one with more than train.shots = {train.shots} demonstrations, of which one shows actions"
             )
             raise ValueError(f"data: {config.recorded.path} has no such training task, expected {expected}")
-        sizes = settings.horizon, settings.gib, config.seed, train.shots + 1, config.method.chunk
-        self.shards = Shards(self.data, tasks, *sizes)
+        memory = settings.horizon, settings.gib, config.seed, train.shots + 1
+        self.shards = Shards(self.data, tasks, *memory, config.method.chunk, settings.history)
 
         def sample(recorded: Recorded, keys: jax.Array) -> TaskBatch:
             frames = train.support_frames, train.query_frames, train.frame_exponent
@@ -174,9 +175,14 @@ class RecordedRun(Run):
         support = sum(info.has_action) if self.given_action else len(info.lengths)
         return any(info.has_action) and support > shots
 
+    @property
+    def _sizes(self) -> tuple[int, int, int]:
+        """The time steps of a demonstration, of a chunk, and of a history."""
+        return self.config.recorded.horizon, self.config.method.chunk, self.config.recorded.history
+
     @functools.cached_property
     def _vectors(self) -> Statistics:
-        return read_vectors(self.data, self.shards.tasks, self.config.recorded.horizon, self.config.method.chunk)
+        return read_vectors(self.data, self.shards.tasks, *self._sizes)
 
     def _load(self) -> Training:
         if make := self.config.evaluation.gym:
@@ -283,12 +289,12 @@ class RecordedRun(Run):
 
     def _task(self, task: int, shots: int) -> tuple[Recorded, Demo]:
         """Reads a task's queries [D, T, ...], and the first `shots` demonstrations that may be shown as the support."""
-        info, horizon, chunk = self.data.header.tasks[task], self.config.recorded.horizon, self.config.method.chunk
+        info = self.data.header.tasks[task]
         # Those without actions first, where they will do: the others are to be asked.
         numbers = sorted(range(len(info.lengths)), key=lambda i: info.has_action[i] and not self.given_action)
         shown = [i for i in numbers if info.has_action[i] or not self.given_action][:shots]
         asked = [i for i in numbers if info.has_action[i] and i not in shown][: MOST_DEMOS - shots]
-        recorded = jax.tree.map(lambda x: x[0], read_demos(self.data, [task], [[*shown, *asked]], horizon, chunk))
+        recorded = jax.tree.map(lambda x: x[0], read_demos(self.data, [task], [[*shown, *asked]], *self._sizes))
         support = jax.tree.map(lambda x: x[:shots], recorded.demo)
         fill = MOST_DEMOS - len(shown) - len(asked)
         rest = lambda x: np.pad(x[shots:], [(0, fill)] + [(0, 0)] * (x.ndim - 1))  # noqa: E731

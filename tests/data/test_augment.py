@@ -45,3 +45,13 @@ def test_bright_images_stay_within_the_range():
     changed = np.stack([augmented(white, jax.random.key(number), 0, 0.5) for number in range(40)])
     assert (changed == 255).mean() > 0.3
     assert changed.min() >= 127
+
+
+def test_all_images_of_a_history_change_alike():
+    """Changes three images side by side, and each of them alone with the same key."""
+    several, key = np.random.default_rng(1).integers(0, 256, (4, 8, 9, 9), np.uint8), jax.random.key(3)
+    changed = np.asarray(augmented(several, key, 2, 0.3))
+    for first in (0, 3, 6):
+        one = slice(first, first + 3)
+        np.testing.assert_array_equal(changed[..., one], augmented(several[..., one], key, 2, 0.3))
+    assert (changed != several).mean() > 0.9
