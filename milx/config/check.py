@@ -21,9 +21,11 @@ def check_config(config: Config) -> None:
         ValueError: if a value is not allowed; the message names the field, its value and what was expected.
     """
     _check_group(config, "")
-    for field, value in (("method.chunk", config.method.chunk), ("recorded.history", config.recorded.history)):
-        if value > 1 and not config.recorded.path:
-            raise ValueError(f"{field}: got {value}, expected 1 in simulation")
+    recorded = config.recorded
+    of_recordings = ("method.chunk", config.method.chunk, 1), ("recorded.history", recorded.history, 1)
+    for field, value, only in (*of_recordings, ("recorded.crop", recorded.crop, 0)):
+        if value != only and not recorded.path:
+            raise ValueError(f"{field}: got {value}, expected {only} in simulation")
     network = config.network
     if isinstance(network, ConvConfig) and len(network.filters) != len(network.strides):
         expected = f"as many as network.filters = {network.filters}"

@@ -13,7 +13,7 @@ from milx.data.augment import augmented
 from milx.data.dataset import ALL_FIELDS, DataSet, spread
 from milx.data.frames import frame_indices, next_frames, previous_frames
 from milx.data.goals import with_goals
-from milx.methods.history import side_by_side
+from milx.methods.history import stacked
 from milx.types import Array, Demo, TaskBatch, by_field, from_fields
 
 MOST_DEMOS = 16
@@ -62,7 +62,7 @@ def read_later(
     def finish() -> Demo:
         action, observed = done().action, seen()
         several = jax.tree.map(lambda x: x.reshape(horizon, history, *x.shape[1:]), (observed.image, observed.state))
-        return Demo(*side_by_side(*several), None if action is None else action.reshape(horizon, -1))
+        return Demo(*stacked(*several), None if action is None else action.reshape(horizon, -1))
 
     return finish
 
@@ -127,6 +127,7 @@ def sample_batch(
     goal_indices: tuple[int, ...],
     shift: int = 0,
     recolor: float = 0.0,
+    crop: int = 0,
 ) -> TaskBatch:
     """Draws tasks and different demonstrations of each; the query is one that shows actions.
 
@@ -141,6 +142,7 @@ def sample_batch(
         goal_indices: entries of the state that tell where the robot is (`milx.data.goals`).
         shift: random changes of the images, others for every demonstration (`milx.data.augment`).
         recolor: likewise.
+        crop: likewise.
     """
     support = recorded.acts if given_action else recorded.there
     enough = (recorded.acts.any(axis=1) & (support.sum(axis=1) > shots)).astype(jnp.float32)
@@ -158,9 +160,10 @@ def sample_batch(
             index = frame_indices(key, horizon, frames, exponent)
             demo = jax.tree.map(lambda x: x[n, d], recorded.demo)
             drawn = jax.tree.map(lambda x: x[index], with_goals(demo, goal_indices, None))
-            if not (shift or recolor):
+            if not (shift or recolor or crop):
                 return drawn
-            return dataclasses.replace(drawn, image=augmented(drawn.image, jax.random.fold_in(key, 1), shift, recolor))
+            image = augmented(drawn.image, jax.random.fold_in(key, 1), shift, recolor, crop)
+            return dataclasses.replace(drawn, image=image)
 
         shown = [show(chosen[k], frame_keys[k], support_frames) for k in range(shots)]
         asked = show(query, frame_keys[shots], query_frames)

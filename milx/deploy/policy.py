@@ -20,7 +20,7 @@ from milx.data.dataset import spread
 from milx.data.frames import in_chunks, previous_frames
 from milx.data.goals import with_goals
 from milx.methods import Method
-from milx.methods.history import side_by_side
+from milx.methods.history import stacked
 from milx.types import SPEC_FILE, Array, Demo, Memory, Observation, Params, Spec, TaskParams, by_field, from_fields
 
 
@@ -78,7 +78,7 @@ class Policy:
             return demo
         frames = spread(jax.tree.leaves(demo)[0].shape[1], self.horizon)
         before = previous_frames(frames, self.config.recorded.history)
-        image, state = side_by_side(*jax.tree.map(lambda x: x[:, before], (demo.image, demo.state)))
+        image, state = stacked(*jax.tree.map(lambda x: x[:, before], (demo.image, demo.state)))
         rest = jax.tree.map(lambda x: x[:, frames], dataclasses.replace(demo, image=None, state=None))
         return dataclasses.replace(rest, image=image, state=state)
 

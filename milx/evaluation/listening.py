@@ -46,7 +46,7 @@ def measure(method: Method, params: Params, batch: TaskBatch, most: int | None =
     most = most or len(batch.query.action)
 
     def adapt(params: Params, support: Demo) -> TaskParams:
-        return map_in_groups(functools.partial(method.adapt, params), (support,), most)
+        return map_in_groups(functools.partial(method.predictor.adapt, params), (support,), most)
 
     adapted = parallel.shard_tasks(adapt, shared=1)(params, batch.support)
     return compare(method, params, adapted, batch.query, most)

@@ -28,8 +28,8 @@ def task_errors(
         method: what adapts and acts.
         shots: K.
         params: what it has learned.
-        queries: [D, T, ...] demonstrations to predict the actions of.
-        support: [K, T, ...] demonstrations to adapt to.
+        queries: [D, T, ...] demonstrations to predict the actions of, as the method's `predictor` sees them.
+        support: [K, T, ...] demonstrations to adapt to, likewise.
         other: demonstrations of another task; None for none.
         mean: [A] the training tasks' mean action.
         scale: [A] their standard deviation.
@@ -38,6 +38,7 @@ def task_errors(
         "after" adaptation; "before", if the method can act without; after adaptation to the "other_task"; and of the
         "mean_action".
     """
+    method = method.predictor
     weight = queries.acts / queries.acts.sum()
 
     def error(action: jax.Array) -> jax.Array:

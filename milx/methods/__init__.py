@@ -10,6 +10,7 @@ from milx.config.schema import GIVEN, Config, ConvConfig
 from milx.methods.base import Method
 from milx.methods.chunks import Chunked
 from milx.methods.contextual import make_contextual, make_lstm, make_lstm_attention
+from milx.methods.crop import Cropped, cropped_shape
 from milx.methods.history import History
 from milx.methods.mil import MILConfig, make_mil
 from milx.methods.whitening import Whitening
@@ -50,7 +51,7 @@ def make(config: Config, spec: Spec) -> Method:
     fixed = config.network.fixed_filters if isinstance(config.network, ConvConfig) else None
     if fixed is not None and spec.image_shape is None:
         raise ValueError(f"network.fixed_filters: got {fixed!r}, expected None: this policy sees no pixels")
-    history = config.recorded.history
+    history, crop = config.recorded.history, config.recorded.crop
     if fixed is not None and history > 1:
         expects = f"None: its filters see one image, and the policy recorded.history = {history} at once"
         raise ValueError(f"network.fixed_filters: got {fixed!r}, expected {expects}")
@@ -59,12 +60,15 @@ def make(config: Config, spec: Spec) -> Method:
         raise ValueError(f"method.execute: got {execute}, expected at most method.chunk = {chunk}")
     whole = dataclasses.replace(
         spec,
+        image_shape=cropped_shape(spec.image_shape, crop),
         state_size=history * spec.state_size,
         action_size=chunk * spec.action_size,
         class_indices=classes(config, spec),
     )
     method = entry.make(config, whole)
     assert isinstance(method, Method)
+    if crop:
+        method = Cropped(method, crop)
     if history > 1:
         method = History(method, history, spec.image_shape, spec.state_size)
     return method if chunk == 1 else Chunked(method, chunk, execute, spec.action_size, spec.class_indices)

@@ -22,7 +22,7 @@ class Method(abc.ABC):
 
     @property
     def predictor(self) -> "Method":
-        """The method that sees and predicts what demonstrations hold: itself without chunks and without a history."""
+        """The method inside that is trained: it sees, and predicts, what demonstrations hold in training."""
         return self
 
     @property

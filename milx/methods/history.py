@@ -10,7 +10,7 @@ from milx.methods.base import Wrapper
 from milx.types import ImageShape, Memory, Observation, TaskParams, black
 
 
-def side_by_side(image: Any, state: Any) -> tuple[Any, Any]:
+def stacked(image: Any, state: Any) -> tuple[Any, Any]:
     """Puts N observations side by side, the latest first, so that indices of entries of its state stay what they are.
 
     Args:
@@ -29,7 +29,7 @@ def side_by_side(image: Any, state: Any) -> tuple[Any, Any]:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class History(Wrapper):
-    """A method that sees the latest N observations `side_by_side`; the first of an episode stands for those before it.
+    """A method that sees the latest N observations `stacked`; the first of an episode stands for those before it.
 
     Attributes:
         method: demonstrations and whitening have the observations side by side, too.
@@ -46,7 +46,7 @@ class History(Wrapper):
         """Acts on the history; the memory holds the N - 1 observations before, whether there are any, and the rest."""
         before = jax.tree.map(lambda x, now: jnp.where(memory["begun"], x, now), memory["before"], observation)
         seen = jax.tree.map(lambda now, x: jnp.concatenate([now[None], x]), observation, before)
-        both = Observation(*side_by_side(seen.image, seen.state))
+        both = Observation(*stacked(seen.image, seen.state))
         action, inner = self.method.act(task_params, both, memory["method"])
         before = jax.tree.map(lambda x: x[:-1], seen)
         return action, {"method": inner, "before": before, "begun": jnp.ones((), bool)}

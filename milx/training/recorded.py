@@ -5,6 +5,7 @@ the mean action of the training tasks does: 1 minus the ratio of the squared err
 are chosen by the policy's success in a world instead.
 """
 
+import dataclasses
 import functools
 import pathlib
 import sys
@@ -29,6 +30,7 @@ from milx.deploy.policy import Policy, read_spec
 from milx.evaluation import plots
 from milx.evaluation.open_loop import task_errors
 from milx.methods import whitening
+from milx.methods.crop import middle
 from milx.training.metrics import read_metrics
 from milx.training.run import Run
 from milx.training.state import Training
@@ -158,7 +160,7 @@ class RecordedRun(Run):
 
         def sample(recorded: Recorded, keys: jax.Array) -> TaskBatch:
             frames = train.support_frames, train.query_frames, train.frame_exponent
-            changes = settings.shift, settings.recolor
+            changes = settings.shift, settings.recolor, settings.crop
             indices = tuple(settings.goal_indices)
             return sample_batch(recorded, keys, train.shots, *frames, self.given_action, indices, *changes)
 
@@ -295,6 +297,8 @@ class RecordedRun(Run):
         shown = [i for i in numbers if info.has_action[i] or not self.given_action][:shots]
         asked = [i for i in numbers if info.has_action[i] and i not in shown][: MOST_DEMOS - shots]
         recorded = jax.tree.map(lambda x: x[0], read_demos(self.data, [task], [[*shown, *asked]], *self._sizes))
+        image = middle(recorded.demo.image, self.config.recorded.crop)
+        recorded = dataclasses.replace(recorded, demo=dataclasses.replace(recorded.demo, image=image))
         support = jax.tree.map(lambda x: x[:shots], recorded.demo)
         fill = MOST_DEMOS - len(shown) - len(asked)
         rest = lambda x: np.pad(x[shots:], [(0, fill)] + [(0, 0)] * (x.ndim - 1))  # noqa: E731
