@@ -147,4 +147,4 @@ def _parts(arrays: dict[str, np.ndarray], spec: Spec) -> tuple[Any, np.ndarray |
 
 
 def _nothing(spec: Spec) -> Observation:
-    return Observation(black(spec.image_shape), np.zeros(spec.state_size, np.float32) if spec.state_size else None)
+    return Observation(black(spec.image_shape), np.zeros(spec.state_size, np.float32))

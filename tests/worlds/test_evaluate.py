@@ -249,6 +249,28 @@ def test_larger_pictures_are_shrunk_and_other_ones_refused(policy):
         evaluate_in(other, "point_world:make_pictured", square, controls=["random"], episodes=1, workers=1)
 
 
+def test_worlds_without_an_episode_do_not_disturb_a_policy_that_sees_images_alone(policy):
+    """Runs one episode in one of three worlds, of which two have nothing to do, and in the only one."""
+    image = np.random.default_rng(0).integers(0, 256, (9, 20, 30, 3), np.uint8)
+    tasks = [Task("near/left", "near", (Demo(image, None, np.zeros((9, 2))),))]
+    seeing = dataclasses.replace(policy, spec=Spec((20, 30), 0, 2, None, ()), method=Watcher())
+    one, of_three = (
+        evaluate_in(
+            seeing,
+            "point_world:make_pictured_well",
+            tasks,
+            controls=["own"],
+            episodes=1,
+            seed=0,
+            workers=workers,
+            film=1,
+        )[0].images
+        for workers in (1, 3)
+    )
+    np.testing.assert_array_equal(one, of_three)
+    assert len(np.unique(np.stack(one))) > 5
+
+
 def test_anybody_can_speak_the_protocol():
     """Asks the world's process itself, as a policy of somebody else's would."""
     client = Client("point_world:make_pictured", sys.executable, 60)
