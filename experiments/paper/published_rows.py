@@ -116,9 +116,10 @@ _RESULTS = {
 
 _SLOWER = _ADAM | {"optimizer.learning_rate": 3e-4}
 _BASELINES = {
-    f"{env}-{method}-{given.replace('+', '-')}": Row(
-        f"{env}, {label}, {given}", env, _SLOWER | {"method.given": given}, published, shots, method
+    f"{env}-{method}-{given.replace('+', '-')}{end}": Row(
+        f"{env}, {label}, {given}{how}", env, changes | {"method.given": given}, published, shots, method
     )
+    for end, how, changes in (("", "", _SLOWER), ("-muon", ", Muon", _MUON))
     for env, shots, method, label, given, published in (
         ("push", (1, 5), "lstm", "LSTM", "video+state+action", "78.4 / 83.1%"),
         ("push", (1, 5), "lstm", "LSTM", "video+state", "37.6 / 39.6%"),
