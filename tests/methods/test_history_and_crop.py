@@ -1,6 +1,7 @@
-"""Policies that see a history: what demonstrations hold of it, what is remembered, and a task that needs it."""
+"""Policies that see a history of cropped images: what demonstrations hold of it, and what is remembered and cut out."""
 
 import dataclasses
+import functools
 import pickle
 
 import jax
@@ -12,7 +13,9 @@ import milx
 from milx import methods
 from milx.config.assemble import make_config
 from milx.config.check import check_config
+from milx.data.cameras import resized
 from milx.data.dataset import DataSet, Writer, spread
+from milx.data.frames import in_chunks
 from milx.data.recorded import read_demos, read_later, sample_batch
 from milx.deploy import standalone
 from milx.export import export
@@ -22,7 +25,7 @@ from milx.types import Demo, Observation, Spec
 from milx.worlds.actor import Actor
 from milx.worlds.slot import Episode, Outcome, Task
 
-HISTORY, SIZES = 3, {"scene": (8, 10), "hand": (6, 6)}
+HISTORY, CROP, CHUNK, SIZES = 3, 2, 2, {"scene": (10, 12), "hand": (7, 8)}
 RNG = np.random.default_rng(0)
 
 
@@ -46,6 +49,20 @@ def seen_at(demo, t, history=HISTORY):
     steps = [max(t - i, 0) for i in range(history)]
     image = {name: np.concatenate([x[step] for step in steps], axis=-1) for name, x in demo.image.items()}
     return Observation(image, np.concatenate([demo.state[step] for step in steps]))
+
+
+def middle(image):
+    return {name: x[..., CROP : x.shape[-3] - CROP, CROP : x.shape[-2] - CROP, :] for name, x in image.items()}
+
+
+def at(demo, t):
+    return Observation(jax.tree.map(lambda x: x[t], demo.image), demo.state[t])
+
+
+def seen_inside(demo, t):
+    """Returns what the method inside sees: the middle of the images of a history."""
+    seen = seen_at(demo, t)
+    return Observation(middle(seen.image), seen.state)
 
 
 def equal(a, b):
@@ -84,55 +101,102 @@ def test_the_latest_observation_of_a_history_is_what_there_is_without_one(folder
     equal(one.query, latest(several.query))
 
 
-def tiny(folder, method="mil"):
-    config = recorded.config_for(folder, method, "cpu")
-    config.recorded.horizon, config.recorded.history = 6, HISTORY
+@pytest.fixture(
+    scope="module",
+    params=["mil", *(pytest.param(method, marks=pytest.mark.slow) for method in ("contextual", "lstm"))],
+)
+def run(request, cache, folder, tmp_path_factory):
+    config = recorded.config_for(folder, request.param, "cpu")
+    config.recorded.horizon, config.recorded.history, config.recorded.crop = 6, HISTORY, CROP
     config.recorded.shift, config.recorded.recolor, config.recorded.goal_indices = 1, 0.1, (0, 1)
-    config.method.chunk, config.method.execute = 2, 2
+    config.method.chunk = config.method.execute = CHUNK
     config.network.filters, config.network.strides, config.network.fc_layers = (4, 4), (2, 1), (8,)
     config.network.goal_head, config.method.goal_weight = True, 1.0
     config.train.steps = config.train.log_every = config.train.eval_every = 2
     config.train.meta_batch = 2
-    return config
-
-
-@pytest.fixture(scope="module", params=["mil", "contextual", "lstm"])
-def policy(request, cache, folder, tmp_path_factory):
-    run = make_run(tiny(folder, request.param), tmp_path_factory.mktemp("run"), QUIET)
+    run = make_run(config, tmp_path_factory.mktemp("run"), QUIET)
     run.train()
-    assert np.isfinite(run.evaluate()["score"])
+    return run
+
+
+@pytest.fixture(scope="module")
+def policy(run):
     return milx.load(run.folder)
+
+
+def test_a_policy_adapts_to_the_middle_of_what_a_loop_has_put_side_by_side(policy, folder):
+    demo = DataSet(folder).read(0, 1)
+    shown = [seen_at(demo, t) for t in spread(11, 6)]
+    image, state = jax.tree.map(lambda *xs: np.stack(xs)[None], *((seen.image, seen.state) for seen in shown))
+    prepared = policy.prepared(demo)
+    equal((image, state), (prepared.image, prepared.state))
+    inside = dataclasses.replace(prepared, image=middle(prepared.image))
+    learned = jax.jit(policy.method.predictor.adapt)(policy.params, inside)
+    close = functools.partial(np.testing.assert_allclose, atol=1e-6)
+    jax.tree.map(close, policy.adapt(policy.params, demo), learned)
 
 
 def test_a_policy_and_its_export_act_on_what_they_have_seen(policy, folder, tmp_path):
     """Gives the method inside, without a memory, what a loop has put side by side: chunks of two, both executed."""
     demo, query = DataSet(folder).read(0, 1), random_demo(7)
     learned = policy.adapt(policy.params, demo)
-    stacked = [seen_at(demo, t) for t in spread(11, 6)]
-    shown = jax.tree.map(lambda *xs: np.stack(xs)[None], *stacked)
-    prepared = policy.prepared(demo)
-    equal((shown.image, shown.state), (prepared.image, prepared.state))
     expected, again = [], pickle.loads(pickle.dumps(policy))
-    for t in range(0, 7, 2):
-        plan = policy.method.predictor.act(learned, seen_at(query, t), ())[0]
-        expected += list(np.reshape(plan, (2, 2)))
+    for t in range(0, 7, CHUNK):
+        plan = policy.method.predictor.act(learned, seen_inside(query, t), ())[0]
+        expected += list(np.reshape(plan, (CHUNK, 2)))
     export(policy, tmp_path / "exported")
     alone = standalone.Policy(tmp_path / "exported")
     known = alone.adapt(image=demo.image, state=demo.state, action=demo.action)
     memories = policy.initial_memory, again.initial_memory, alone.initial_memory
     for t in range(7):
-        image, state = jax.tree.map(lambda x, t=t: x[t], query.image), query.state[t]
-        seen = Observation(image, state)
+        seen = at(query, t)
         actions, memories = zip(
             policy.step(learned, seen, memories[0]),
             again.step(learned, seen, memories[1]),
-            alone.step(known, memories[2], image=image, state=state),
+            alone.step(known, memories[2], image=seen.image, state=seen.state),
             strict=True,
         )
         for action in actions:
             np.testing.assert_allclose(action, expected[t], atol=1e-5)
     with pytest.raises(ValueError, match="memory: missing"):
         policy.act(learned, seen)
+
+
+def test_an_exported_policy_shrinks_images_and_then_cuts_the_middle_out(policy, folder, tmp_path):
+    """Gives it the camera's own size, and images whose border alone is different."""
+    demo, seen = DataSet(folder).read(0, 1), at(random_demo(1), 0)
+    export(policy, tmp_path / "exported")
+    alone = standalone.Policy(tmp_path / "exported")
+    learned = alone.adapt(image=demo.image, state=demo.state, action=demo.action)
+
+    def act(image):
+        return np.asarray(alone.step(learned, alone.initial_memory, image=image, state=seen.state)[0])
+
+    action = act(seen.image)
+    black = {name: np.zeros_like(x) for name, x in seen.image.items()}
+    for name, x in middle(seen.image).items():
+        black[name][CROP:-CROP, CROP:-CROP] = x
+    np.testing.assert_array_equal(act(black), action)
+    black["scene"][CROP] ^= 255
+    assert np.abs(act(black) - action).max() > 1e-4
+    large = {name: RNG.integers(0, 256, (3 * size[0], 3 * size[1], 3), np.uint8) for name, size in SIZES.items()}
+    small = {name: next(resized([image], SIZES[name])) for name, image in large.items()}
+    np.testing.assert_allclose(act(large), act(small), atol=0.02)
+
+
+def test_the_error_on_held_out_tasks_is_that_of_the_policy(run, policy):
+    """Compares with a loop over the test task's other demonstration."""
+
+    def chunks(task, number):
+        demo = run.data.read(task, number)
+        return in_chunks(demo.action, CHUNK)[spread(len(demo.action), 6)]
+
+    scale = np.concatenate([chunks(task, number) for task in (2, 3, 4) for number in range(2)]).std(axis=0)
+    learned, query = policy.adapt(policy.params, run.data.read(1, 0)), run.data.read(1, 1)
+    frames = spread(11, 6)
+    said = [policy.method.predictor.act(learned, seen_inside(query, t), ())[0] for t in frames]
+    expected = np.mean(((np.stack(said) - chunks(1, 1)) / scale) ** 2)
+    np.testing.assert_allclose(run.evaluate()["action_error"]["after"], expected, rtol=1e-4)
 
 
 def test_in_every_world_the_history_begins_with_the_episode(policy, folder):
@@ -145,8 +209,7 @@ def test_in_every_world_the_history_begins_with_the_episode(policy, folder):
     def alone(episode):
         memory, actions = policy.initial_memory, []
         for t in range(len(episode.state)):
-            seen = Observation(jax.tree.map(lambda x, t=t: x[t], episode.image), episode.state[t])
-            action, memory = policy.step(learned, seen, memory)
+            action, memory = policy.step(learned, at(episode, t), memory)
             actions.append(action)
         return actions
 
@@ -157,10 +220,7 @@ def test_in_every_world_the_history_begins_with_the_episode(policy, folder):
         for world, first in ((0, t == 0), (1, step == 0)):
             if first:
                 actor.assign(world, outcome.episode)
-        seen = [
-            Observation(jax.tree.map(lambda x, i=i: x[i], episodes[number].image), episodes[number].state[i])
-            for number, i in ((0, t), (second, step))
-        ]
+        seen = [at(episodes[number], i) for number, i in ((0, t), (second, step))]
         for number, action in zip((0, second), actor.act(seen, [outcome, outcome]), strict=True):
             found[number].append(action)
     for episode, actions in zip(episodes, found, strict=True):
@@ -207,3 +267,16 @@ def test_histories_that_cannot_be_are_refused():
     config.recorded.history = 0
     with pytest.raises(ValueError, match=r"recorded\.history: got 0, expected a whole number, at least 1"):
         check_config(config)
+
+
+def test_crops_that_cannot_be_are_refused():
+    simulated = make_config("reach", preset="cpu")
+    simulated.recorded.crop = 1
+    with pytest.raises(ValueError, match=r"recorded\.crop: got 1, expected 0 in simulation"):
+        check_config(simulated)
+    config = make_config("recorded", preset="cpu")
+    config.recorded.crop = 4
+    with pytest.raises(ValueError, match=r"recorded\.crop: got 4, expected less than half of image\.hand, of 8 x 9"):
+        methods.make(config, Spec({"scene": (20, 20), "hand": (8, 9)}, 3, 2, None, ()))
+    with pytest.raises(ValueError, match=r"recorded\.crop: got 4, expected 0: this policy sees no pixels"):
+        methods.make(config, Spec(None, 3, 2, None, ()))
