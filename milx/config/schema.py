@@ -74,8 +74,8 @@ class RecordedConfig:
         history: number of observations that the policy sees at every time step: the latest one and those of the
             recording's time steps before it; the first of an episode stands for those before it
             (`milx.methods.history`). Images take so many times the memory.
-        crop: number of pixels by which every image is cut on each side: at a random place in training, and so that the
-            middle is left when the policy adapts and acts.
+        crop: images lose twice so many rows and columns: in training a part at a random place is left, and the middle
+            when the policy adapts and acts.
         shift: maximum number of pixels by which the images of a demonstration are moved at random in training.
         recolor: maximum relative change of the brightness of each of their channels in training.
     """

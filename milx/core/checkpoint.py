@@ -243,13 +243,14 @@ class Checkpoints:
 
 @contextlib.contextmanager
 def _silenced() -> Iterator[None]:
-    """Keeps Orbax from logging the tracebacks of errors that it raises as well."""
+    """Keeps Orbax from logging the tracebacks of errors that it raises as well, for good if it has raised one.
+
+    Threads of a save that has failed go on, and would log more when the process ends, after its last message.
+    """
     before = logging.get_verbosity()
     logging.set_verbosity(logging.FATAL)
-    try:
-        yield
-    finally:
-        logging.set_verbosity(before)
+    yield
+    logging.set_verbosity(before)
 
 
 def _reason(error: BaseException) -> str:

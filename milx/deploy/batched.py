@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from milx.data.cameras import name_of
+from milx.deploy import standalone
 from milx.deploy.policy import Policy
 from milx.types import Demo, Memory, Observation, TaskParams, by_field, from_fields, is_image
 
@@ -15,12 +16,17 @@ class Batched:
 
     Args:
         policy: what `milx.load` returns, or the `Policy` of an exported folder (`milx.deploy.standalone`).
+
+    Raises:
+        ValueError: if it is neither.
     """
 
     def __init__(self, policy: Any):
-        self._policy, self._is_exported = policy, not isinstance(policy, Policy)
+        self._policy, self._is_exported = policy, isinstance(policy, standalone.Policy)
         if self._is_exported:
             self._fields = tuple(policy.sizes["act"])
+        elif not isinstance(policy, Policy):
+            raise ValueError(f"policy: got {policy!r:.100}, expected a policy that `milx.load` or an export gives")
         else:
             self._fields = (*by_field(policy.spec.image_shape), *["state"] * bool(policy.spec.state_size))
         self._learned: tuple[TaskParams, ...] = ()
@@ -103,7 +109,10 @@ def observations(batch: Mapping[str, np.ndarray], fields: Sequence[str]) -> list
     found = {}
     for field in fields:
         key = _key(batch, field)
-        found[field] = _images(key, batch[key]) if is_image(field) else _vectors(key, batch[key])
+        value = batch[key]
+        if not isinstance(value, np.ndarray):
+            raise ValueError(f"{key}: got {type(value).__name__}, expected an array")
+        found[field] = _images(key, value) if is_image(field) else _vectors(key, value)
     sizes = {field: len(value) for field, value in found.items()}
     if len(set(sizes.values())) > 1:
         raise ValueError(f"batch: got {sizes} environments, expected the same number in all entries")
@@ -120,7 +129,8 @@ def _key(batch: Mapping[str, np.ndarray], field: str) -> str:
         if len(fitting) == 1:
             return fitting[0]
         got = ", ".join(name for name in batch if name.startswith("observation.")) or "no observations"
-        raise ValueError(f"{key}: missing, expected an array: got {got}")
+        expected = "this entry, or exactly one camera" if field == "image" else "an array"
+        raise ValueError(f"{key}: missing, expected {expected}: got {got}")
     return key
 
 

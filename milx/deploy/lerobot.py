@@ -50,8 +50,8 @@ class LeRobotConfig(PreTrainedConfig):
 class LeRobotPolicy(PreTrainedPolicy):
     """A policy of milx with the interface of LeRobot's policies, as far as evaluation goes.
 
-    It acts in a batch of environments, each with a memory of its own. It needs no processors: pass functions that
-    return what they are given. Actions are not clipped.
+    It acts in a batch of environments, each with a memory of its own. It has no processors: in their places pass
+    functions that return what they are given. Those of the environment are needed as ever. Actions are not clipped.
 
     Args:
         policy: what `milx.load` returns, or the `Policy` of an exported folder (`milx.deploy.standalone`).

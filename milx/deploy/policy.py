@@ -133,7 +133,8 @@ class Policy:
     @functools.cached_property
     def initial_memory(self) -> Memory:
         """The memory at the start of an episode; empty for most policies."""
-        return self.method.initial_memory(jax.random.key(0))
+        with jax.ensure_compile_time_eval():  # arrays, even if a program that is being traced asks first
+            return self.method.initial_memory(jax.random.key(0))
 
     @functools.cached_property
     def _adapt(self) -> Any:

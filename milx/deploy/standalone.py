@@ -58,6 +58,7 @@ class Policy:
         exported = [jax.export.deserialize(bytearray(program)) for program in programs]
         for name, program, after in zip(("adapt", "act"), exported, (0, len(self.initial_memory)), strict=True):
             _check_inputs(folder / "policy.json", name, self.sizes[name], program.in_avals, after)
+        _check_lengths(folder / "policy.json", self.sizes, self.chunk, self.history)
         self._adapt, self._act = (jax.jit(program.call) for program in exported)
 
     def adapt(self, **demo: np.ndarray) -> list[jax.Array]:
@@ -188,6 +189,15 @@ def _areas(size: int, smaller: int) -> np.ndarray:
 
 def _rounded(sums: np.ndarray) -> np.ndarray:
     return np.clip(np.floor((sums + 2.0**21) / 2.0**22), 0, 255)
+
+
+def _check_lengths(path: pathlib.Path, sizes: dict, chunk: int, history: int) -> None:
+    """Raises ValueError if time steps of demonstrations do not hold a chunk of actions or a history of observations."""
+    for name, (*_, size) in sizes["adapt"].items():
+        field, count = ("chunk", chunk) if name == "action" else ("history", history)
+        one = sizes["act"].get(name, [size // count])[-1]
+        if size != count * one:
+            raise ValueError(f"{path}: {field}: got {count}, expected {size / one:g}, as adapt takes {name} of {size}")
 
 
 def _check_inputs(path: pathlib.Path, name: str, fields: dict, takes: tuple, after: int) -> None:

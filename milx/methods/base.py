@@ -72,7 +72,7 @@ class Method(abc.ABC):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Wrapper(Method):
-    """A method that learns as another one does, and differs from it in how it acts.
+    """A method that learns as another one does, and differs from it in what it is given, or in how it acts.
 
     Attributes:
         method: the other one.

@@ -43,7 +43,7 @@ class History(Wrapper):
     state_size: int
 
     def act(self, task_params: TaskParams, observation: Observation, memory: Memory) -> tuple[jax.Array, Memory]:
-        """Acts on the history; the memory holds the N - 1 observations before, whether there are any, and the rest."""
+        """Acts on the history; the memory holds the N - 1 observations before, if there are any, and the method's."""
         before = jax.tree.map(lambda x, now: jnp.where(memory["begun"], x, now), memory["before"], observation)
         seen = jax.tree.map(lambda now, x: jnp.concatenate([now[None], x]), observation, before)
         both = Observation(*stacked(seen.image, seen.state))

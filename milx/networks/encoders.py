@@ -47,9 +47,9 @@ class ContextNetwork(NamedTuple):
 
     Attributes:
         init: key -> params.
-        encode: (params, image [T, H, W, 3] uint8 or None, whitened state [T, S], whitened action [T, A]) -> context, a
-            pytree: what is kept of a demonstration. With several cameras `image` is a dictionary of images by name.
-        apply: (params, context, image [B, H, W, 3] uint8 or None, whitened state [B, S]) -> PolicyOutput.
+        encode: (params, image [T, H, W, 3 N] uint8 or None, whitened state [T, S], whitened action [T, A]) -> context,
+            a pytree: what is kept of a demonstration. With several cameras `image` is a dictionary of images by name.
+        apply: (params, context, image [B, H, W, 3 N] uint8 or None, whitened state [B, S]) -> PolicyOutput.
     """
 
     init: Callable[[jax.Array], Params]

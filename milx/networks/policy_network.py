@@ -71,7 +71,7 @@ class PolicyNetwork(NamedTuple):
 
     Attributes:
         init: key -> params.
-        apply: (params, image [B, H, W, 3] uint8 or None, whitened state [B, S]) -> PolicyOutput. With several cameras
+        apply: (params, image [B, H, W, 3 N] uint8 or None, whitened state [B, S]) -> PolicyOutput. With several cameras
             `image` is a dictionary of images by name. For a target head it takes two more: `length`, as many
             consecutive images as show one episode, whose first tells the target of all; and `target` [B, G], where it
             is known already, NaN where it is not.
@@ -91,7 +91,7 @@ class PolicyNetwork(NamedTuple):
 
 
 class ConvStack(nn.Module):
-    """All convolutions: images [B, H, W, 3] uint8 to a feature map [B, H', W', C] of the parameters' type."""
+    """All convolutions: images [B, H, W, 3 N] uint8 to a feature map [B, H', W', C] of the parameters' type."""
 
     config: ConvConfig
 

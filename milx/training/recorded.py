@@ -155,8 +155,16 @@ class RecordedRun(Run):
                 f"at least one with more than train.shots = {train.shots} demonstrations, of which one shows actions"
             )
             raise ValueError(f"data: {config.recorded.path} has no such training task, expected {expected}")
-        memory = settings.horizon, settings.gib, config.seed, train.shots + 1
-        self.shards = Shards(self.data, tasks, *memory, config.method.chunk, settings.history)
+        self.shards = Shards(
+            self.data,
+            tasks,
+            settings.horizon,
+            settings.gib,
+            config.seed,
+            acting=train.shots + 1,
+            chunk=config.method.chunk,
+            history=settings.history,
+        )
 
         def sample(recorded: Recorded, keys: jax.Array) -> TaskBatch:
             frames = train.support_frames, train.query_frames, train.frame_exponent
@@ -196,7 +204,7 @@ class RecordedRun(Run):
             statistics = whitening.fit(*vectors, self.config.method.whiten_actions, classes)
             dataset_hash = self.data.fingerprint()
             held_out = [i for split in ("validation", "test") for i in self.data.header.of_split(split)]
-            read_vectors(self.data, held_out, self.config.recorded.horizon)  # refuses what is not finite
+            read_vectors(self.data, held_out, *self._sizes)  # refuses what is not finite
         count = sum(len(self.data.header.tasks[i].lengths) for i in self.shards.tasks)
         self.console.print(f"{count} demonstrations of {len(self.shards.tasks)} training tasks")
         at = lambda step: self.shards.at(step // self.config.train.log_every)  # noqa: E731
@@ -204,7 +212,8 @@ class RecordedRun(Run):
 
     def _first_images(self) -> list[np.ndarray]:
         first = [self.data.read(task, 0, np.zeros(1, int), fields=("image",)).image for task in self.shards.tasks[:128]]
-        return list(by_field(jax.tree.map(lambda *images: np.concatenate(images), *first)).values())
+        joined = jax.tree.map(lambda *images: np.concatenate(images), *first)
+        return list(by_field(middle(joined, self.config.recorded.crop)).values())
 
     def _shapes(self) -> Recorded:
         return self.shards.shapes

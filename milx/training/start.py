@@ -3,9 +3,9 @@
 A file holds arrays by name. A name is that of a parameter (`pytrees.leaves`), or its end: "vision.ConvBlock_0.kernel"
 is the first convolution's kernel [k, k, channels, filters] in all networks that see one camera, whatever the method.
 Of several cameras each has its "vision_CAMERA", unless they share an encoder. A convolution also has a "bias" [filters]
-and a "centre" [filters], which is added after the norm; images come in as [H, W, 3] in [0, 1]. Residual block j after
-convolution i has "Residual_i_j_0" and "Residual_i_j_1", with such arrays. Parameters without axes, such as learned
-inner rates, are drawn.
+and a "centre" [filters], which is added after the norm; images come in as [H, W, 3 N] in [0, 1], the latest of N first.
+Residual block j after convolution i has "Residual_i_j_0" and "Residual_i_j_1", with such arrays. Parameters without
+axes, such as learned inner rates, are drawn.
 """
 
 import pathlib

@@ -160,6 +160,10 @@ def test_a_policy_and_its_export_act_on_what_they_have_seen(policy, folder, tmp_
             np.testing.assert_allclose(action, expected[t], atol=1e-5)
     with pytest.raises(ValueError, match="memory: missing"):
         policy.act(learned, seen)
+    header = tmp_path / "exported" / "policy.json"
+    header.write_text(header.read_text().replace('"history": 3', '"history": 9'))
+    with pytest.raises(ValueError, match=r"policy\.json: history: got 9, expected 3, as adapt takes .* of 9"):
+        standalone.Policy(tmp_path / "exported")
 
 
 def test_an_exported_policy_shrinks_images_and_then_cuts_the_middle_out(policy, folder, tmp_path):
@@ -225,6 +229,29 @@ def test_in_every_world_the_history_begins_with_the_episode(policy, folder):
             found[number].append(action)
     for episode, actions in zip(episodes, found, strict=True):
         np.testing.assert_allclose(actions, alone(episode), atol=1e-5)
+
+
+def test_a_memory_that_a_program_asks_for_first_is_none_of_its_tracers(policy):
+    again = pickle.loads(pickle.dumps(policy))
+    inside = jax.jit(lambda: again.initial_memory)()
+    equal(inside, again.initial_memory)
+
+
+def test_values_that_only_a_history_sees_are_checked_as_well(cache, tmp_path):
+    """Has one in a validation task, at a time step that is not among those that it is resampled to."""
+    with Writer(tmp_path / "set", None, 1, 1) as writer:
+        for task in range(3):
+            demos = [Demo(None, np.zeros((31, 1), np.float32), np.ones((31, 1), np.float32)) for _ in range(2)]
+            if task == 0:
+                demos[1].state[9] = np.nan
+            writer.add(f"task {task}", ("validation", "test", "train")[task], [31, 31], demos)
+    assert 9 not in spread(31, 4)
+    config = recorded.config_for(tmp_path / "set", preset="cpu")
+    config.recorded.horizon, config.recorded.history, config.network.fc_layers = 4, 2, (8,)
+    with pytest.raises(
+        ValueError, match=r"data: state of demonstration 1 of task 0 .*: got values that are not"
+    ):
+        make_run(config, tmp_path / "run", QUIET).train()
 
 
 @pytest.fixture(scope="module")
