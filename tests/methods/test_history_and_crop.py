@@ -248,9 +248,7 @@ def test_values_that_only_a_history_sees_are_checked_as_well(cache, tmp_path):
     assert 9 not in spread(31, 4)
     config = recorded.config_for(tmp_path / "set", preset="cpu")
     config.recorded.horizon, config.recorded.history, config.network.fc_layers = 4, 2, (8,)
-    with pytest.raises(
-        ValueError, match=r"data: state of demonstration 1 of task 0 .*: got values that are not"
-    ):
+    with pytest.raises(ValueError, match=r"data: state of demonstration 1 of task 0 .*: got values that are not"):
         make_run(config, tmp_path / "run", QUIET).train()
 
 
