@@ -3,8 +3,10 @@
     python experiments/robustness/failures.py                   # each operation once, the kinds of failure in turn
     python experiments/robustness/failures.py --every=1 --kinds=SIGKILL
     python experiments/robustness/failures.py --calls --every=7    # every seventh call to the C library
+    python experiments/robustness/failures.py --planning           # lives that plan demonstrations
 
-A life imports demonstrations, trains, validates and writes checkpoints, evaluates, exports and loads. In a process of
+A life imports demonstrations, trains, validates and writes checkpoints, evaluates, exports and loads. With `--planning`
+it plans demonstrations and keeps them instead, and their fingerprint stands for that of the parameters. In a process of
 its own it is disturbed once, at the n-th operation on a file that Python makes in its folder: opening, synchronizing,
 locking, renaming, removing, or making a folder. With `--calls` it is the n-th call to the C library that touches a
 file there, reading and writing included, also of TensorStore, HDF5 and Arrow (Linux, with a C compiler). It has to end
@@ -98,10 +100,33 @@ def disturb(folder: pathlib.Path, at: int, kind: str) -> list[int]:
     return count
 
 
+def plan(folder: pathlib.Path) -> Any:
+    """Plans 12 demonstrations in three parts, or goes on with them, and returns them."""
+    import milx
+    from milx.config.schema import DataConfig
+    from milx.data import simulated
+
+    settings = DataConfig(plan_batch=4, plan_iterations=2)
+    return simulated.cached(folder / "cache", milx.make("reach_state"), 0, "train", 4, 3, settings)
+
+
 def live(folder: pathlib.Path, at: int, kind: str) -> None:
     """Lives a life, or goes on with one, and prints its result as JSON."""
     import milx
     from milx.core import commands, pytrees
+
+    logging.set_verbosity(logging.ERROR)  # as the launchers do
+    milx.configure()
+    count = disturb(folder, at, kind)
+    with commands.command():
+        made = plan(folder) if FLAGS.planning else train(folder)
+    operations = ctypes.CDLL(None).fail_calls_count() if "FAIL_IN" in os.environ else count[0]
+    print(json.dumps({"params": pytrees.fingerprint(made), "operations": operations}))
+
+
+def train(folder: pathlib.Path) -> Any:
+    """Imports, trains, evaluates, exports and loads, or goes on with that, and returns the parameters."""
+    import milx
     from milx.data import episodes
     from milx.data.robomimic import Robomimic
     from milx.deploy import standalone
@@ -109,27 +134,21 @@ def live(folder: pathlib.Path, at: int, kind: str) -> None:
     from milx.training import recorded
     from milx.training.factory import make_run
 
-    logging.set_verbosity(logging.ERROR)  # as the launchers do
-    milx.configure()
-    count = disturb(folder, at, kind)
-    with commands.command():
-        if not (folder / "set").exists():
-            source = Robomimic(folder.parent / "demos.hdf5", "", "robot", "actions", 8)
-            found = source.episodes(str(folder.parent / "tasks.json"))
-            episodes.write(folder / "set", found, source.contents, (0.2, 0.2), "a recording")
-        config = recorded.config_for(folder / "set", preset="cpu")
-        config.recorded.horizon, config.network.fc_layers = 6, (8,)
-        config.train.meta_batch, config.train.log_every, config.train.eval_every = 2, 2, 4
-        config.train.steps = 8
-        run = make_run(config, folder / "run")
-        run.train()
-        run.evaluate()
-        if not (folder / "exported").exists():
-            export(milx.load(folder / "run"), folder / "exported")
-        standalone.Policy(folder / "exported")
-        params = milx.load(folder / "run").params
-    operations = ctypes.CDLL(None).fail_calls_count() if "FAIL_IN" in os.environ else count[0]
-    print(json.dumps({"params": pytrees.fingerprint(params), "operations": operations}))
+    if not (folder / "set").exists():
+        source = Robomimic(folder.parent / "demos.hdf5", "", "robot", "actions", 8)
+        found = source.episodes(str(folder.parent / "tasks.json"))
+        episodes.write(folder / "set", found, source.contents, (0.2, 0.2), "a recording")
+    config = recorded.config_for(folder / "set", preset="cpu")
+    config.recorded.horizon, config.network.fc_layers = 6, (8,)
+    config.train.meta_batch, config.train.log_every, config.train.eval_every = 2, 2, 4
+    config.train.steps = 8
+    run = make_run(config, folder / "run")
+    run.train()
+    run.evaluate()
+    if not (folder / "exported").exists():
+        export(milx.load(folder / "run"), folder / "exported")
+    standalone.Policy(folder / "exported")
+    return milx.load(folder / "run").params
 
 
 class Outcome(NamedTuple):
@@ -156,9 +175,11 @@ def compile_calls(folder: pathlib.Path) -> pathlib.Path:
     return library
 
 
-def begin(folder: pathlib.Path, at: int = 0, kind: str = "", library: pathlib.Path | None = None) -> Outcome:
+def begin(
+    folder: pathlib.Path, at: int = 0, kind: str = "", library: pathlib.Path | None = None, planning: bool = False
+) -> Outcome:
     """Lives in a process of its own, in which an operation of Python fails or, with the library, a call."""
-    command = [sys.executable, __file__, f"--life={folder}"]
+    command = [sys.executable, __file__, f"--life={folder}", *["--planning"] * planning]
     environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(folder.parent / "programs")}
     if library:
         number = str(int(getattr(signal, kind))) if kind.startswith("SIG") else kind
@@ -197,13 +218,18 @@ def wrong(disturbed: Outcome, again: Outcome, kind: str, params: str) -> list[st
 
 
 def fail_once(
-    folder: pathlib.Path, at: int, kind: str, params: str, library: pathlib.Path | None = None
+    folder: pathlib.Path,
+    at: int,
+    kind: str,
+    params: str,
+    library: pathlib.Path | None = None,
+    planning: bool = False,
 ) -> dict[str, Any]:
     """Disturbs a life, begins it again, and reports both."""
     mine = folder / f"{at:04d}-{kind}"
     mine.mkdir()
-    disturbed = begin(mine, at, kind, library)
-    again = begin(mine)
+    disturbed = begin(mine, at, kind, library, planning)
+    again = begin(mine, planning=planning)
     shutil.rmtree(mine)
     return {
         "operation": at,
@@ -224,7 +250,8 @@ def main(_: list[str]) -> None:
     from milx.evaluation import provenance
 
     results = pathlib.Path(__file__).parents[1] / "results" / "robustness"
-    out = pathlib.Path(FLAGS.out or results / ("failures-calls-cpu.json" if FLAGS.calls else "failures-cpu.json"))
+    file = "-".join(["failures", *["planning"] * FLAGS.planning, *["calls"] * FLAGS.calls, "cpu.json"])
+    out = pathlib.Path(FLAGS.out or results / file)
     with tempfile.TemporaryDirectory() as name:
         folder = pathlib.Path(name)
         write_recording(folder)
@@ -235,14 +262,14 @@ def main(_: list[str]) -> None:
             raise app.UsageError(f"--kinds: got {unknown[0]!r}, expected some of {', '.join(possible)}")
         for number in range(2):  # the first one compiles
             (folder / f"good{number}").mkdir()
-            good = begin(folder / f"good{number}", library=library)
+            good = begin(folder / f"good{number}", library=library, planning=FLAGS.planning)
             print(f"undisturbed: exit code {good.code}, {good.seconds:.1f} s, {good.result}", flush=True)
         params, operations = good.result["params"], good.result["operations"]
         numbers = range(FLAGS.first, operations + 1, FLAGS.every)
         with concurrent.futures.ThreadPoolExecutor(FLAGS.processes) as pool:
             pairs = zip(numbers, itertools.cycle(kinds), strict=False)
             lives = []
-            for life in pool.map(lambda pair: fail_once(folder, *pair, params, library), pairs):
+            for life in pool.map(lambda pair: fail_once(folder, *pair, params, library, FLAGS.planning), pairs):
                 lives.append(life)
                 if life["wrong"]:
                     print(
@@ -258,11 +285,12 @@ def main(_: list[str]) -> None:
 
 if __name__ == "__main__":
     flags.DEFINE_bool("calls", False, "Calls to the C library instead of operations of Python.")
+    flags.DEFINE_bool("planning", False, "Lives that plan demonstrations, and no more.")
     flags.DEFINE_list("kinds", None, "What happens; with several, each operation gets the next one. Default all.")
     flags.DEFINE_integer("first", 1, "The first operation.", lower_bound=1)
     flags.DEFINE_integer("every", 1, "Only every so many operations.", lower_bound=1)
     flags.DEFINE_integer("processes", 2, "Lives at once.", lower_bound=1)
-    flags.DEFINE_string("out", None, "The JSON file; default experiments/results/robustness/failures-cpu.json.")
+    flags.DEFINE_string("out", None, "The JSON file; default one in experiments/results/robustness.")
     flags.DEFINE_string("life", None, "Folder of a life to live, in place of all the above.")
     flags.DEFINE_integer("at", 0, "With --life: the operation at which it is disturbed; 0 for none.")
     flags.DEFINE_string("kind", "", "With --life: by what.")
