@@ -3,8 +3,9 @@
     python board.py SET --runs=RUNS                                    # trains, on a GPU
     python board.py SET --runs=RUNS --python=../../.mw/bin/python      # also acts in the world and prints the table
     python board.py --show
+    python board.py UNSEEN --unseen --runs=RUNS --rows=lstm --rows=mil-one-action --episodes=25
 
-SET is what `meta_world.py` says how to record. What is finished is not done again.
+SET is what `meta_world.py` says how to record, and UNSEEN what `unseen.py` does. What is finished is not done again.
 """
 
 import pathlib
@@ -20,7 +21,11 @@ from milx.training.recorded import RecordedRun, config_for
 from milx.worlds import report
 from milx.worlds.actor import CONTROLS
 
-RESULTS = pathlib.Path(__file__).parents[1] / "results" / "meta_world"
+RESULTS = {
+    world: pathlib.Path(__file__).parents[1] / "results" / folder
+    for world, folder in (("meta_world:make", "meta_world"), ("unseen:make", "meta_world_unseen"))
+}
+"""The folder of the results by the world in which policies act."""
 COMMON: dict[str, Any] = {
     "network.kernel": 3,
     "network.goal_head": False,
@@ -72,9 +77,9 @@ def configure(row: str, data: str, seed: int) -> Config:
     return config
 
 
-def judged(config: Config, folder: pathlib.Path, python: str, workers: int, episodes: int) -> dict[str, Any]:
+def judged(config: Config, folder: pathlib.Path, world: str, **options: Any) -> dict[str, Any]:
     """Lets a trained policy act in the world, and returns the result of its training with that of the world."""
-    report.report_on(config, folder, "meta_world:make", python=python, workers=workers, episodes=episodes)
+    report.report_on(config, folder, world, **options)
     trained, acted = (files.read_json(folder / name) for name in ("evaluation.json", report.FILE))
     origin = {name: acted[name] for name in ("commit", "hardware", "versions")}
     return trained | {"world": {name: acted[name] for name in ("criterion", "tasks", "controls", "lost")} | origin}
@@ -96,9 +101,9 @@ def markdown(found: dict[str, dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def read() -> dict[str, dict[str, Any]]:
-    """Reads the results, by row and seed."""
-    return {path.stem: files.read_json(path) for path in sorted(RESULTS.glob("*.json"))}
+def read(world: str = "meta_world:make") -> dict[str, dict[str, Any]]:
+    """Reads the results in a world, by row and seed."""
+    return {path.stem: files.read_json(path) for path in sorted(RESULTS[world].glob("*.json"))}
 
 
 def main(argv: list[str]) -> None:
@@ -106,20 +111,23 @@ def main(argv: list[str]) -> None:
     milx.configure()
     if not _SHOW.value and len(argv) != 2:
         raise app.UsageError("expected one argument, SET")
+    world = "unseen:make" if _UNSEEN.value else "meta_world:make"
     for row in [] if _SHOW.value else _ROWS.value:
         for seed in range(_SEEDS.value):
             config, name = configure(row, argv[1], seed), f"{row}-{seed}"
-            if (RESULTS / f"{name}.json").exists():
+            path = RESULTS[world] / f"{name}.json"
+            if path.exists():
                 continue
             run = RecordedRun(config, pathlib.Path(_RUNS.value) / name)
             run.train()
             if not (run.folder / "evaluation.json").exists():
                 run.report(run.evaluate())
             if _PYTHON.value:
-                result = judged(config, run.folder, _PYTHON.value, _WORKERS.value, _EPISODES.value)
+                options = {"python": _PYTHON.value, "workers": _WORKERS.value, "episodes": _EPISODES.value}
+                result = judged(config, run.folder, world, **options)
                 result["config"]["recorded"]["path"] = pathlib.Path(argv[1]).name
-                files.write_json(RESULTS / f"{name}.json", result)
-    print(markdown(read()))
+                files.write_json(path, result)
+    print(markdown(read(world)))
 
 
 if __name__ == "__main__":
@@ -129,5 +137,6 @@ if __name__ == "__main__":
     _PYTHON = flags.DEFINE_string("python", None, "The interpreter that runs Meta-World; none to train only.")
     _WORKERS = flags.DEFINE_integer("workers", 2, "Worlds at once.")
     _EPISODES = flags.DEFINE_integer("episodes", 2, "Episodes of every test task and control.")
+    _UNSEEN = flags.DEFINE_bool("unseen", False, "Unseen kinds of tasks.")
     _SHOW = flags.DEFINE_bool("show", False, "Print what there is, and run nothing.")
     app.run(main)
