@@ -1,0 +1,242 @@
+"""Sampling-based planning: predictive sampling, the cross-entropy method and path integrals (MPPI).
+
+The problem is that of `ilqr.py`. Nothing is differentiated, so contacts may come early, late or not at all. The actions
+are a spline of K knots θ in R^{K x m}, at even intervals from the first step to the last,
+
+    u_t = clip(Σ_k B_tk θ_k, low, high),
+
+where B [T, K] holds a knot until the next one (order 0), or interpolates linearly (1) or by a natural cubic spline (3).
+One iteration draws N candidates around a mean θ̄, the first of which is the mean itself,
+
+    θ_i = θ̄ + σ ε_i    with  ε_0 = 0  and  ε_i ~ N(0, I),
+
+rolls all of them out, and moves the mean by their costs J_i:
+
+    predictive sampling    θ̄ ← θ_i of the lowest J_i
+    cross-entropy          θ̄, σ ← mean and standard deviation of the E cheapest candidates, σ at least σ_min
+    MPPI                   θ̄ ← Σ_i w_i θ_i / Σ_i w_i    with  w_i = exp(-(J_i - min_j J_j) / λ).
+
+Candidates whose states are not finite cost infinitely much; where all do, the mean stays.
+
+References:
+    Howell et al., "Predictive sampling: real-time behaviour synthesis with MuJoCo", arXiv:2212.00541.
+    Rubinstein & Kroese, "The cross-entropy method", Springer 2004.
+    Williams et al., "Information theoretic MPC for model-based reinforcement learning", ICRA 2017.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.interpolate
+from jax import lax
+
+from milx.trajopt.ilqr import Problem
+
+ORDERS = (0, 1, 3)
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Settings of the planner.
+
+    Attributes:
+        update: how candidates move the mean, one of UPDATES.
+        samples: N.
+        iterations: how often.
+        order: of the spline, one of ORDERS.
+        elites: E, for the cross-entropy method.
+        deviation_min: σ_min, for the cross-entropy method, in the units of the actions.
+        temperature: λ, for MPPI, in the units of the cost.
+
+    Raises:
+        ValueError: for an update or an order that does not exist, or more elites than samples.
+    """
+
+    update: str = "predictive"
+    samples: int = 64
+    iterations: int = 1
+    order: int = 1
+    elites: int = 8
+    deviation_min: float = 0.0
+    temperature: float = 1.0
+
+    def __post_init__(self) -> None:
+        for field, allowed in (("update", tuple(UPDATES)), ("order", ORDERS)):
+            if (value := getattr(self, field)) not in allowed:
+                raise ValueError(f"{field}: got {value!r}, expected one of {', '.join(map(str, allowed))}")
+        if self.update == "cross_entropy" and not 1 < self.elites <= self.samples:
+            raise ValueError(f"elites: got {self.elites}, expected 2 to samples = {self.samples}")
+
+
+class Search(NamedTuple):
+    """What one plan hands to the next.
+
+    Attributes:
+        knots: [K, m], θ̄.
+        deviation: [K, m], σ, in the units of the actions.
+        cost: the lowest J_i of the last iteration; inf before the first.
+    """
+
+    knots: jax.Array
+    deviation: jax.Array
+    cost: jax.Array
+
+
+def start(knots: jax.Array, deviation: jax.Array | float) -> Search:
+    """Begins a search around knots [K, m]; `deviation` is broadcast to the same shape."""
+    knots = jnp.asarray(knots)
+    return Search(knots, jnp.broadcast_to(jnp.asarray(deviation, knots.dtype), knots.shape), jnp.asarray(jnp.inf))
+
+
+def basis(order: int, steps: np.ndarray, horizon: int, knots: int) -> np.ndarray:
+    """Computes the rows [len(steps), K] of B at these time steps, which need not be whole, of T = `horizon`.
+
+    Steps after the last one get the last one's row.
+
+    Raises:
+        ValueError: if there is no knot, or more than one for each time step.
+    """
+    if not 1 <= knots <= horizon:
+        raise ValueError(f"knots: got {knots}, expected 1 to {horizon}, the time steps")
+    at, when = np.linspace(0, horizon - 1, knots), np.clip(steps, 0, horizon - 1)
+    if knots == 1:
+        return np.ones((len(when), 1))
+    if order == 0:
+        return np.eye(knots)[np.searchsorted(at, when, side="right") - 1]
+    if order == 1:
+        return np.stack([np.interp(when, at, row) for row in np.eye(knots)], axis=1)
+    return scipy.interpolate.CubicSpline(at, np.eye(knots), bc_type="natural")(when)
+
+
+def actions_of(problem: Problem, knots: jax.Array, horizon: int, options: Options) -> jax.Array:
+    """Returns the actions [T, m] of knots [K, m]."""
+    rows = jnp.asarray(basis(options.order, np.arange(horizon), horizon, len(knots)), knots.dtype)
+    return jnp.clip(rows @ knots, problem.control_low, problem.control_high)
+
+
+def _cost(problem: Problem, initial_state: jax.Array, actions: jax.Array) -> jax.Array:
+    """Rolls actions [T, m] out and returns J; inf if a state is not finite."""
+
+    def step(x, inputs):
+        t, u = inputs
+        r = problem.running_residual(x, u, t)
+        return problem.dynamics(x, u), 0.5 * r @ r
+
+    last, costs = lax.scan(step, initial_state, (jnp.arange(len(actions), dtype=jnp.int32), actions))
+    r_T = problem.terminal_residual(last)
+    cost = costs.sum() + 0.5 * r_T @ r_T
+    return jnp.where(jnp.isfinite(last).all() & jnp.isfinite(cost), cost, jnp.inf)
+
+
+def solve(
+    problem: Problem, initial_state: jax.Array, search: Search, horizon: int, key: jax.Array, options: Options
+) -> Search:
+    """Goes on with a search from an initial state. Pure and jittable; `jax.vmap` gives batches with a key for each.
+
+    Args:
+        problem: what to solve; `approximation` is not used.
+        initial_state: x_0, [n].
+        search: around what to look.
+        horizon: T.
+        key: draws the candidates.
+        options: settings.
+    """
+
+    def iterate(search: Search, key: jax.Array) -> tuple[Search, None]:
+        noise = jax.random.normal(key, (options.samples, *search.knots.shape), search.knots.dtype).at[0].set(0.0)
+        candidates = search.knots + search.deviation * noise
+        actions = jax.vmap(lambda knots: actions_of(problem, knots, horizon, options))(candidates)
+        costs = jax.vmap(lambda actions: _cost(problem, initial_state, actions))(actions)
+        moved = UPDATES[options.update](search, candidates, costs, options)
+        least = costs.min()
+        search = jax.tree.map(lambda new, old: jnp.where(jnp.isfinite(least), new, old), moved, search)
+        return search._replace(cost=least), None
+
+    search = search._replace(cost=search.cost.astype(initial_state.dtype))
+    return lax.scan(iterate, search, jax.random.split(key, options.iterations))[0]
+
+
+def _predictive(search: Search, candidates: jax.Array, costs: jax.Array, options: Options) -> Search:
+    return search._replace(knots=candidates[jnp.argmin(costs)])
+
+
+def _cross_entropy(search: Search, candidates: jax.Array, costs: jax.Array, options: Options) -> Search:
+    best = lax.top_k(-costs, options.elites)[1]
+    finite = jnp.isfinite(costs[best])[:, None, None]
+    mean = candidates[best].mean(axis=0, where=finite)
+    deviation = candidates[best].std(axis=0, where=finite)
+    return search._replace(knots=mean, deviation=jnp.maximum(deviation, options.deviation_min))
+
+
+def _mppi(search: Search, candidates: jax.Array, costs: jax.Array, options: Options) -> Search:
+    weights = jnp.exp(-(costs - costs.min()) / options.temperature)
+    return search._replace(knots=jnp.tensordot(weights / weights.sum(), candidates, axes=1))
+
+
+UPDATES = {"predictive": _predictive, "cross_entropy": _cross_entropy, "mppi": _mppi}
+"""How the mean moves, by name."""
+
+
+def control(
+    problem: Problem,
+    initial_state: jax.Array,
+    search: Search,
+    horizon: int,
+    steps: int,
+    every: int,
+    key: jax.Array,
+    options: Options,
+    plant: Callable[[jax.Array, jax.Array, jax.Array], jax.Array] | None = None,
+) -> tuple[jax.Array, jax.Array]:
+    """Executes the first actions of a plan, plans again from where they lead, and so on (receding horizon).
+
+    The plan before is the next one's mean, moved on by the steps that were executed; σ begins anew. A running residual
+    is given the time since the first step.
+
+    Args:
+        problem: what is planned.
+        initial_state: x_0, [n].
+        search: the first one.
+        horizon: T, time steps that are planned ahead.
+        steps: S, time steps that are executed, a multiple of `every`.
+        every: time steps from one plan to the next.
+        key: draws candidates, and what `plant` draws.
+        options: settings.
+        plant: (x [n], u [m], key) -> next x [n], what happens; the problem's dynamics by default.
+
+    Returns:
+        States [S + 1, n] and actions [S, m].
+
+    Raises:
+        ValueError: if `steps` is not a multiple of `every`, or `every` is more than the horizon.
+    """
+    if steps % every or every > horizon:
+        raise ValueError(f"every: got {every}, expected a divisor of steps = {steps}, at most horizon = {horizon}")
+    happens = plant or (lambda x, u, key: problem.dynamics(x, u))
+    knot_steps = np.linspace(0, horizon - 1, len(search.knots)) + every
+    moved = jnp.asarray(basis(options.order, knot_steps, horizon, len(search.knots)), search.knots.dtype)
+
+    def act(x: jax.Array, inputs: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+        u, key = inputs
+        after = happens(x, u, key)
+        return after, (after, u)
+
+    def replan(carry, inputs):
+        x, knots = carry
+        now, key = inputs
+        plan_key, act_key = jax.random.split(key)
+        ahead = problem._replace(running_residual=lambda x, u, t: problem.running_residual(x, u, now + t))
+        found = solve(ahead, x, search._replace(knots=knots), horizon, plan_key, options)
+        actions = actions_of(problem, found.knots, horizon, options)[:every]
+        x, executed = lax.scan(act, x, (actions, jax.random.split(act_key, every)))
+        return (x, moved @ found.knots), executed
+
+    times = jnp.arange(0, steps, every, dtype=jnp.int32)
+    inputs = times, jax.random.split(key, len(times))
+    _, (states, actions) = lax.scan(replan, (initial_state, search.knots), inputs)
+    states = jnp.concatenate([initial_state[None], states.reshape(steps, -1)])
+    return states, actions.reshape(steps, -1)
