@@ -8,7 +8,7 @@ are a spline of K knots θ in R^{K x m}, at even intervals from the first step t
 where B [T, K] holds a knot until the next one (order 0), or interpolates linearly (1) or by a natural cubic spline (3).
 One iteration draws N candidates around a mean θ̄, the first of which is the mean itself,
 
-    θ_i = θ̄ + σ ε_i    with  ε_0 = 0  and  ε_i ~ N(0, I),
+    θ_i = clip(θ̄ + σ ε_i, low, high)    with  ε_0 = 0  and  ε_i ~ N(0, I),
 
 rolls all of them out, and moves the mean by their costs J_i:
 
@@ -149,6 +149,7 @@ def solve(
     def iterate(search: Search, key: jax.Array) -> tuple[Search, None]:
         noise = jax.random.normal(key, (options.samples, *search.knots.shape), search.knots.dtype).at[0].set(0.0)
         candidates = search.knots + search.deviation * noise
+        candidates = jnp.clip(candidates, problem.control_low, problem.control_high)
         actions = jax.vmap(lambda knots: actions_of(problem, knots, horizon, options))(candidates)
         costs = jax.vmap(lambda actions: _cost(problem, initial_state, actions))(actions)
         moved = UPDATES[options.update](search, candidates, costs, options)

@@ -68,7 +68,7 @@ def test_limits_are_kept_and_their_best_cost_is_reached():
     lq = random_lq(3, T=6, n=3, m=1)
     limit = 0.3
     best, first = bounded_least_squares(lq, limit)[1], cost(lq, np.zeros((6, 1)))
-    options = Options("cross_entropy", samples=256, elites=32, iterations=60, order=0)
+    options = Options("cross_entropy", samples=256, elites=32, iterations=60, order=0, deviation_min=0.02)
     _, actions = plan(lq, options, limit)
     assert np.abs(actions).max() <= limit + 1e-12
     assert best * (1 - 1e-6) <= cost(lq, actions) < best + 1e-2 * (first - best)
