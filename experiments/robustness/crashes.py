@@ -10,6 +10,7 @@ code 143 and a word on how to go on.
 import pathlib
 import random
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -150,6 +151,7 @@ def main(_: list[str]) -> None:
         terms = []
         while len(terms) < _TERMS.value:
             workdir = folder / f"term-{len(terms)}"
+            shutil.rmtree(workdir, ignore_errors=True)  # of a run that had ended before the signal
             found = terminate(folder / "data", workdir, rng, 0.7 * longest)
             if found["sent"]:
                 found["same"] = finish(folder / "data", workdir) == expected
