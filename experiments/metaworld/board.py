@@ -58,6 +58,11 @@ ROWS: dict[str, tuple[str, str, dict[str, Any]]] = {
         _MIL | {"train.steps": 20_000, "train.eval_every": 10_000},
     ),
     "mil-coarse": ("MIL + learned rates, chunks; strides 2, 2, 2, 1", "mil", _MIL | {"network.strides": (2, 2, 2, 1)}),
+    "mil-defaults": (
+        "MIL + learned rates; strides 2, 2, 2, 1: the defaults of --data",
+        "mil",
+        _MIL | {"network.strides": (2, 2, 2, 1), "method.chunk": 1},
+    ),
     "mil-one-action": ("MIL + learned rates", "mil", _MIL | {"method.chunk": 1}),
     "mil-few-frames": (
         "MIL + learned rates, chunks; 4 and 8 time steps",
@@ -66,6 +71,10 @@ ROWS: dict[str, tuple[str, str, dict[str, Any]]] = {
     ),
 }
 """Policies by name: what the table calls them, the method, and what else differs."""
+
+
+_WITHOUT = ("replay", "mean_action", "random")
+"""What acts without a policy."""
 
 
 def configure(row: str, data: str, seed: int) -> Config:
@@ -86,19 +95,24 @@ def judged(config: Config, folder: pathlib.Path, world: str, **options: Any) -> 
 
 
 def markdown(found: dict[str, dict[str, Any]]) -> str:
-    """Writes a table of what there is: success at any time, over all tasks and by family, after what was shown."""
+    """Writes a table of what there is: success at any time, over all tasks and by family, after what was shown.
+
+    What acts without a policy comes last, and once where it came to the same numbers.
+    """
     families = sorted({family for run in found.values() for family in run["world"]["controls"]["own"]["families"]})
     header = ["", "after", "success (95%)", "at the end", "episodes", *(name.removesuffix("-v3") for name in families)]
     lines = [f"| {' | '.join(header)} |", "|---" * len(header) + "|"]
+    without = []
     for name, run in found.items():
         label, seed = ROWS[name.rpartition("-")[0]][0], name.rpartition("-")[2]
         for control, rates in run["world"]["controls"].items():
             low, high = rates["ever_wilson95"]
-            columns = [f"{label}, seed {seed}", CONTROLS[control], f"{rates['ever']:.1%} ({low:.0%} to {high:.0%})"]
+            who = "no policy" if control in _WITHOUT else f"{label}, seed {seed}"
+            columns = [who, CONTROLS[control], f"{rates['ever']:.1%} ({low:.0%} to {high:.0%})"]
             columns += [f"{rates['end']:.1%}", str(rates["episodes"])]
             columns += [f"{rates['families'][family]['ever']:.0%}" for family in families]
-            lines.append(f"| {' | '.join(columns)} |")
-    return "\n".join(lines)
+            (without if control in _WITHOUT else lines).append(f"| {' | '.join(columns)} |")
+    return "\n".join([*lines, *dict.fromkeys(without)])
 
 
 def read(world: str = "meta_world:make") -> dict[str, dict[str, Any]]:

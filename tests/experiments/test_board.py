@@ -54,9 +54,11 @@ def test_the_table_has_a_line_for_each_control():
         name: rates(ever, 0.25, 8) | {"families": {"push-v3": rates(ever, 0.0, 4), "reach-v3": rates(1.0, 0.0, 4)}}
         for name, ever in (("own", 0.75), ("random", 0.125))
     }
-    lines = board.markdown({"mil-7": {"world": {"controls": controls}}}).splitlines()
+    run = {"world": {"controls": controls}}
+    lines = board.markdown({"mil-7": run, "lstm-0": run}).splitlines()
     assert lines[0] == "|  | after | success (95%) | at the end | episodes | push | reach |"
     assert lines[1] == "|---" * 7 + "|"
     label = "MIL + learned rates, chunks, seed 7"
     assert lines[2] == f"| {label} | its own demonstration | 75.0% (65% to 85%) | 25.0% | 8 | 75% | 100% |"
-    assert lines[3] == f"| {label} | random actions | 12.5% (2% to 22%) | 25.0% | 8 | 12% | 100% |"
+    assert lines[3].startswith("| LSTM + chunks, seed 0 | its own demonstration | 75.0%")
+    assert lines[4:] == ["| no policy | random actions | 12.5% (2% to 22%) | 25.0% | 8 | 12% | 100% |"]
