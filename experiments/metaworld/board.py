@@ -36,7 +36,7 @@ COMMON: dict[str, Any] = {
     "train.steps": 20_000,
     "train.eval_every": 10_000,
 }
-"""What differs from the preset `fast` in all rows, by dotted name."""
+"""What all rows set, by dotted name."""
 _FINE = {"network.strides": (2, 1, 1, 1)}
 _GOAL_HEAD = {"network.goal_head": True, "method.goal_weight": 1.0, "recorded.goal_indices": (0, 1, 2)}
 _MIL = _FINE | {"train.support_frames": 10, "train.steps": 10_000, "train.eval_every": 5000}
@@ -61,7 +61,7 @@ ROWS: dict[str, tuple[str, str, dict[str, Any]]] = {
     "mil-defaults": (
         "MIL + learned rates; strides 2, 2, 2, 1: the defaults of --data",
         "mil",
-        _MIL | {"network.strides": (2, 2, 2, 1), "method.chunk": 1},
+        _MIL | {"network.strides": (2, 2, 2, 1), "method.chunk": 1, "train.eval_every": 1000},
     ),
     "mil-one-action": ("MIL + learned rates", "mil", _MIL | {"method.chunk": 1}),
     "mil-few-frames": (

@@ -1,6 +1,7 @@
 """Presets of recorded demonstrations: those of push, whose images are the largest, with fewer updates.
 
-Time steps, kernels and learning rate of `fast` are those that did well on Meta-World (docs/results/meta_world.md).
+Time steps, kernels and learning rate of `fast` are those of policies that did well on Meta-World; the time steps have
+been compared with others there (docs/results/meta_world.md).
 """
 
 from milx.config.registry import Overrides

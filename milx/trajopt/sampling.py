@@ -1,11 +1,12 @@
 """Sampling-based planning: predictive sampling, the cross-entropy method and path integrals (MPPI).
 
 The problem is that of `ilqr.py`. Nothing is differentiated, so contacts may come early, late or not at all. The actions
-are a spline of K knots θ in R^{K x m}, at even intervals from the first step to the last,
+are a spline of K knots θ in R^{K x m},
 
     u_t = clip(Σ_k B_tk θ_k, low, high),
 
-where B [T, K] holds a knot until the next one (order 0), or interpolates linearly (1) or by a natural cubic spline (3).
+where B [T, K] holds each knot for T/K steps (order 0), or interpolates linearly (1) or by a natural cubic spline (3)
+between knots at even intervals from the first step to the last.
 One iteration draws N candidates around a mean θ̄, the first of which is the mean itself,
 
     θ_i = clip(θ̄ + σ ε_i, low, high)    with  ε_0 = 0  and  ε_i ~ N(0, I),
@@ -14,9 +15,10 @@ rolls all of them out, and moves the mean by their costs J_i:
 
     predictive sampling    θ̄ ← θ_i of the lowest J_i
     cross-entropy          θ̄, σ ← mean and standard deviation of the E cheapest candidates, σ at least σ_min
+                           (of those among them whose cost is finite; one alone leaves σ as it is)
     MPPI                   θ̄ ← Σ_i w_i θ_i / Σ_i w_i    with  w_i = exp(-(J_i - min_j J_j) / λ).
 
-Candidates whose states are not finite cost infinitely much; where all do, the mean stays.
+Candidates with a state that is not finite cost infinitely much; where all do, the mean stays.
 
 References:
     Howell et al., "Predictive sampling: real-time behaviour synthesis with MuJoCo", arXiv:2212.00541.
@@ -37,6 +39,8 @@ from jax import lax
 from milx.trajopt.ilqr import Problem
 
 ORDERS = (0, 1, 3)
+_ROUNDING = 1e-9
+"""By which a time step may be rounded, in intervals between knots."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,7 +57,7 @@ class Options:
         temperature: λ, for MPPI, in the units of the cost.
 
     Raises:
-        ValueError: for an update or an order that does not exist, or more elites than samples.
+        ValueError: for a value that is not allowed, or more elites than samples.
     """
 
     update: str = "predictive"
@@ -68,6 +72,13 @@ class Options:
         for field, allowed in (("update", tuple(UPDATES)), ("order", ORDERS)):
             if (value := getattr(self, field)) not in allowed:
                 raise ValueError(f"{field}: got {value!r}, expected one of {', '.join(map(str, allowed))}")
+        for field in ("samples", "iterations"):
+            if (value := getattr(self, field)) < 1:
+                raise ValueError(f"{field}: got {value}, expected at least 1")
+        if self.deviation_min < 0:
+            raise ValueError(f"deviation_min: got {self.deviation_min}, expected at least 0")
+        if self.temperature <= 0:
+            raise ValueError(f"temperature: got {self.temperature}, expected more than 0")
         if self.update == "cross_entropy" and not 1 < self.elites <= self.samples:
             raise ValueError(f"elites: got {self.elites}, expected 2 to samples = {self.samples}")
 
@@ -88,7 +99,7 @@ class Search(NamedTuple):
 
 def start(knots: jax.Array, deviation: jax.Array | float) -> Search:
     """Begins a search around knots [K, m]; `deviation` is broadcast to the same shape."""
-    knots = jnp.asarray(knots)
+    knots = jnp.asarray(knots, float)
     return Search(knots, jnp.broadcast_to(jnp.asarray(deviation, knots.dtype), knots.shape), jnp.asarray(jnp.inf))
 
 
@@ -102,14 +113,19 @@ def basis(order: int, steps: np.ndarray, horizon: int, knots: int) -> np.ndarray
     """
     if not 1 <= knots <= horizon:
         raise ValueError(f"knots: got {knots}, expected 1 to {horizon}, the time steps")
-    at, when = np.linspace(0, horizon - 1, knots), np.clip(steps, 0, horizon - 1)
+    at, when = _times(order, horizon, knots), np.clip(steps, 0, horizon - 1)
+    if order == 0:
+        return np.eye(knots)[np.floor(when * knots / horizon + _ROUNDING).astype(int)]
     if knots == 1:
         return np.ones((len(when), 1))
-    if order == 0:
-        return np.eye(knots)[np.searchsorted(at, when, side="right") - 1]
     if order == 1:
         return np.stack([np.interp(when, at, row) for row in np.eye(knots)], axis=1)
     return scipy.interpolate.CubicSpline(at, np.eye(knots), bc_type="natural")(when)
+
+
+def _times(order: int, horizon: int, knots: int) -> np.ndarray:
+    """Returns the time steps [K] of the knots."""
+    return np.arange(knots) * horizon / knots if order == 0 else np.linspace(0, horizon - 1, knots)
 
 
 def actions_of(problem: Problem, knots: jax.Array, horizon: int, options: Options) -> jax.Array:
@@ -124,18 +140,21 @@ def _cost(problem: Problem, initial_state: jax.Array, actions: jax.Array) -> jax
     def step(x, inputs):
         t, u = inputs
         r = problem.running_residual(x, u, t)
-        return problem.dynamics(x, u), 0.5 * r @ r
+        after = problem.dynamics(x, u)
+        return after, (0.5 * r @ r, jnp.isfinite(after).all())
 
-    last, costs = lax.scan(step, initial_state, (jnp.arange(len(actions), dtype=jnp.int32), actions))
+    last, (costs, finite) = lax.scan(step, initial_state, (jnp.arange(len(actions), dtype=jnp.int32), actions))
     r_T = problem.terminal_residual(last)
     cost = costs.sum() + 0.5 * r_T @ r_T
-    return jnp.where(jnp.isfinite(last).all() & jnp.isfinite(cost), cost, jnp.inf)
+    return jnp.where(finite.all() & jnp.isfinite(cost), cost, jnp.inf)
 
 
 def solve(
     problem: Problem, initial_state: jax.Array, search: Search, horizon: int, key: jax.Array, options: Options
 ) -> Search:
-    """Goes on with a search from an initial state. Pure and jittable; `jax.vmap` gives batches with a key for each.
+    """Goes on with a search from an initial state, in whose data type everything is computed.
+
+    Pure and jittable; `jax.vmap` gives batches with a key for each.
 
     Args:
         problem: what to solve; `approximation` is not used.
@@ -157,7 +176,7 @@ def solve(
         search = jax.tree.map(lambda new, old: jnp.where(jnp.isfinite(least), new, old), moved, search)
         return search._replace(cost=least), None
 
-    search = search._replace(cost=search.cost.astype(initial_state.dtype))
+    search = jax.tree.map(lambda x: x.astype(initial_state.dtype), search)
     return lax.scan(iterate, search, jax.random.split(key, options.iterations))[0]
 
 
@@ -169,7 +188,7 @@ def _cross_entropy(search: Search, candidates: jax.Array, costs: jax.Array, opti
     best = lax.top_k(-costs, options.elites)[1]
     finite = jnp.isfinite(costs[best])[:, None, None]
     mean = candidates[best].mean(axis=0, where=finite)
-    deviation = candidates[best].std(axis=0, where=finite)
+    deviation = jnp.where(finite.sum() > 1, candidates[best].std(axis=0, where=finite), search.deviation)
     return search._replace(knots=mean, deviation=jnp.maximum(deviation, options.deviation_min))
 
 
@@ -196,7 +215,7 @@ def control(
     """Executes the first actions of a plan, plans again from where they lead, and so on (receding horizon).
 
     The plan before is the next one's mean, moved on by the steps that were executed; σ begins anew. A running residual
-    is given the time since the first step.
+    is given the time since the first step, up to S + T - `every` - 1.
 
     Args:
         problem: what is planned.
@@ -213,13 +232,19 @@ def control(
         States [S + 1, n] and actions [S, m].
 
     Raises:
-        ValueError: if `steps` is not a multiple of `every`, or `every` is more than the horizon.
+        ValueError: if `steps` is not a multiple of `every`, or `every` is more than the horizon; if knots are held
+            (order 0) for so long that a plan cannot be moved on by `every` steps.
     """
-    if steps % every or every > horizon:
+    knots = len(search.knots)
+    if not 1 <= every <= horizon or steps % every:
         raise ValueError(f"every: got {every}, expected a divisor of steps = {steps}, at most horizon = {horizon}")
+    if options.order == 0 and every * knots % horizon:
+        held = f"{horizon / knots:g} time steps, for which a knot is held"
+        raise ValueError(f"every: got {every}, expected a multiple of {held}")
     happens = plant or (lambda x, u, key: problem.dynamics(x, u))
-    knot_steps = np.linspace(0, horizon - 1, len(search.knots)) + every
-    moved = jnp.asarray(basis(options.order, knot_steps, horizon, len(search.knots)), search.knots.dtype)
+    later = _times(options.order, horizon, knots) + every
+    search = jax.tree.map(lambda x: x.astype(initial_state.dtype), search)
+    moved = jnp.asarray(basis(options.order, later, horizon, knots), initial_state.dtype)
 
     def act(x: jax.Array, inputs: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
         u, key = inputs

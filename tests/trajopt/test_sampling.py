@@ -38,14 +38,22 @@ def plan(lq, options, limit=np.inf, deviation=1.0, seed=0):
 @pytest.mark.parametrize("order", sampling.ORDERS)
 def test_splines_are_those_of_scipy(order):
     knots = np.random.default_rng(0).normal(size=(5, 2))
-    at, when = np.linspace(0, 16, 5), np.array([0.0, 0.5, 3.9, 4.0, 11.2, 16.0, 25.0])
+    at, when = np.linspace(0, 16, 5), np.array([0.0, 0.5, 3.3, 3.5, 11.2, 16.0, 25.0])
     expected = {
-        0: scipy.interpolate.interp1d(at, knots, kind="previous", axis=0),
+        0: scipy.interpolate.interp1d([*np.arange(5) * 17 / 5, 17], [*knots, knots[-1]], kind="previous", axis=0),
         1: scipy.interpolate.make_interp_spline(at, knots, k=1),
         3: scipy.interpolate.make_interp_spline(at, knots, k=3, bc_type="natural"),
     }[order](np.minimum(when, 16))
     np.testing.assert_allclose(sampling.basis(order, when, 17, 5) @ knots, expected, atol=1e-12)
     np.testing.assert_array_equal(sampling.basis(order, when, 17, 1), np.ones((7, 1)))
+
+
+def test_knots_are_held_for_the_time_steps_that_whole_numbers_say():
+    for horizon in range(1, 60):
+        for knots in range(1, horizon + 1):
+            expected = [step * knots // horizon for step in range(horizon)]
+            rows = sampling.basis(0, np.arange(horizon), horizon, knots)
+            np.testing.assert_array_equal(rows, np.eye(knots)[expected])
 
 
 @pytest.mark.parametrize("update", ["cross_entropy", "mppi"])
@@ -76,17 +84,17 @@ def test_limits_are_kept_and_their_best_cost_is_reached():
 
 def test_more_samples_cost_less_and_no_iteration_of_predictive_sampling_costs_more():
     lq = random_lq(2, T=8, n=3, m=2)
+    problem, state, first = lq_problem(lq, np.inf), jnp.asarray(lq["x_0"]), sampling.start(jnp.zeros((8, 2)), 0.3)
     means = []
     for samples in (2, 16, 128):
-        costs = [
-            plan(lq, Options(samples=samples, iterations=5), deviation=0.3, seed=seed)[0].cost for seed in range(8)
-        ]
-        means.append(np.mean(costs))
+        options = Options(samples=samples, iterations=5)
+        solve = jax.vmap(lambda key, options=options: sampling.solve(problem, state, first, 8, key, options).cost)
+        means.append(jax.jit(solve)(jax.random.split(jax.random.key(0), 8)).mean())
     assert means[0] > means[1] > means[2]
-    problem, state = lq_problem(lq, np.inf), jnp.asarray(lq["x_0"])
-    search = sampling.start(jnp.zeros((8, 2)), 0.3)
+    step = jax.jit(lambda search, key: sampling.solve(problem, state, search, 8, key, Options(samples=8)))
+    search = first
     for key in jax.random.split(jax.random.key(1), 20):
-        after = sampling.solve(problem, state, search, 8, key, Options(samples=8))
+        after = step(search, key)
         np.testing.assert_allclose(after.cost, cost(lq, np.asarray(after.knots)), rtol=1e-9)
         assert after.cost <= search.cost
         search = after
@@ -107,28 +115,71 @@ def test_a_batch_is_a_loop(update):
 
 
 @pytest.mark.parametrize("update", sampling.UPDATES)
-def test_candidates_that_diverge_count_for_nothing(update):
-    """Compares with the same problem in which their cost is so high that they do not count, and lets all diverge."""
-    lq = random_lq(5, T=5, n=2, m=1)
+@pytest.mark.parametrize("edge", [0.2, -0.35])
+def test_candidates_that_diverge_count_for_nothing(update, edge):
+    """Compares with the same problem in which their cost is so high that they do not count; few or many are lost."""
+    lq = random_lq(5, T=3, n=2, m=1)
     problem = lq_problem(lq, np.inf)
 
     def edged(value):
-        residual = lambda x, u, t: problem.running_residual(x, u, t) + jnp.where(u[0] > 0.2, value, 0.0)  # noqa: E731
+        residual = lambda x, u, t: problem.running_residual(x, u, t) + jnp.where(u[0] > edge, value, 0.0)  # noqa: E731
         return problem._replace(running_residual=residual)
 
-    options = Options(update, samples=64, elites=4, order=0)
-    first, state, key = sampling.start(jnp.zeros((5, 1)), 0.2), jnp.asarray(lq["x_0"]), jax.random.key(0)
-    found, expected = (sampling.solve(edged(x), state, first, 5, key, options) for x in (np.nan, 1e8))
+    options = Options(update, samples=64, elites=2 if edge < 0 else 8, order=0)
+    first, state, key = sampling.start(jnp.full((3, 1), edge), 0.2), jnp.asarray(lq["x_0"]), jax.random.key(0)
+    found, expected = (sampling.solve(edged(x), state, first, 3, key, options) for x in (np.nan, 1e8))
     np.testing.assert_allclose(found.knots, expected.knots, atol=1e-12)
-    lost = sampling.solve(edged(0.0)._replace(dynamics=lambda x, u: x * np.nan), state, first, 5, key, options)
+    np.testing.assert_allclose(found.deviation, expected.deviation, atol=1e-12)
+
+
+@pytest.mark.parametrize("update", sampling.UPDATES)
+def test_where_all_diverge_the_search_stays(update):
+    """Loses the second of three states, which the dynamics make finite again, and the costs do not see."""
+    problem = sampling.Problem(
+        dynamics=lambda x, u: jnp.stack([u[0], x[1] + jnp.where(jnp.isfinite(x[0]), 1.0, 0.0)]),
+        running_residual=lambda x, u, t: u,
+        terminal_residual=lambda x: x[:1],
+        control_low=jnp.full(1, -np.inf),
+        control_high=jnp.full(1, np.inf),
+    )
+    options, first = Options(update, samples=8, elites=4, order=0), sampling.start(jnp.zeros((2, 1)), 1.0)
+    state, key = jnp.zeros(2), jax.random.key(0)
+    assert np.isfinite(sampling.solve(problem, state, first, 2, key, options).cost)
+    once = lambda x, u: jnp.where(x[1] == 0, jnp.array([np.nan, 1.0]), problem.dynamics(jnp.nan_to_num(x), u))  # noqa: E731
+    lost = sampling.solve(problem._replace(dynamics=once), state, first, 2, key, options)
     np.testing.assert_array_equal(lost.knots, first.knots)
+    np.testing.assert_array_equal(lost.deviation, first.deviation)
     assert lost.cost == np.inf
+
+
+def test_one_elite_that_is_left_does_not_end_the_search():
+    """Loses all candidates but the mean: where their deviation stayed zero, the search would never move again."""
+    problem = lq_problem(random_lq(5, T=3, n=2, m=1), np.inf)
+    only = lambda x, u, t: problem.running_residual(x, u, t) + jnp.where(u[0] == 0, 0.0, np.nan)  # noqa: E731
+    options, first = Options("cross_entropy", samples=16, elites=4, order=0), sampling.start(jnp.zeros((3, 1)), 0.5)
+    state = jnp.ones(2)
+    found = sampling.solve(problem._replace(running_residual=only), state, first, 3, jax.random.key(0), options)
+    np.testing.assert_array_equal(found.deviation, first.deviation)
+    assert np.isfinite(found.cost)
+
+
+def test_float32_finds_nearly_what_float64_does():
+    lq = random_lq(1, T=6, n=3, m=1)
+    options = Options("cross_entropy", samples=256, elites=32, iterations=60, order=0)
+    first = sampling.start(jnp.zeros((6, 1)), 1.0)
+    with jax.enable_x64(False):
+        small = {name: value.astype(np.float32) for name, value in lq.items()}
+        state = jnp.asarray(small["x_0"])
+        found = sampling.solve(lq_problem(small, np.inf), state, first, 6, jax.random.key(0), options)
+        assert found.knots.dtype == jnp.float32
+    best = cost(lq, riccati(lq)[1])
+    assert cost(lq, np.asarray(found.knots, np.float64)) < best + 1e-2 * (cost(lq, np.zeros((6, 1))) - best)
 
 
 def test_planning_again_costs_less_where_things_turn_out_otherwise():
     """Executes one plan to its end, and replans every second step, under the same disturbances."""
     lq = random_lq(1, T=12, n=3, m=2)
-    lq["reference"][:] = 0.0
+    lq["reference"] = np.concatenate([lq["reference"], np.zeros((12, 3))])
     problem, state = lq_problem(lq, np.inf), jnp.asarray(lq["x_0"])
     options = Options("cross_entropy", samples=64, elites=8, iterations=10, order=0)
     first = sampling.start(jnp.zeros((12, 2)), 1.0)
@@ -136,9 +187,17 @@ def test_planning_again_costs_less_where_things_turn_out_otherwise():
     def plant(x, u, key):
         return problem.dynamics(x, u) + 0.3 * jax.random.normal(key, x.shape)
 
+    draws = jax.jit(
+        lambda key: sampling.control(
+            problem, state, first, 12, 6, 2, key, options, lambda x, u, key: x + jax.random.normal(key, x.shape)
+        )
+    )
+    noise = np.diff(draws(jax.random.key(0))[0], axis=0)
+    assert len(np.unique(noise)) == noise.size
+
     def run(every, key):
         states, actions = sampling.control(problem, state, first, 12, 12, every, key, options, plant)
-        running = jax.vmap(lambda x, u: problem.running_residual(x, u, 0))(states[:-1], actions)
+        running = jax.vmap(problem.running_residual)(states[:-1], actions, jnp.arange(12))
         return 0.5 * jnp.sum(running**2) + 0.5 * jnp.sum(problem.terminal_residual(states[-1]) ** 2)
 
     keys = jax.random.split(jax.random.key(0), 20)
@@ -146,21 +205,24 @@ def test_planning_again_costs_less_where_things_turn_out_otherwise():
     assert often.mean() + 2 * (often - once).std() / np.sqrt(20) < once.mean()
 
 
-def test_a_plan_goes_on_where_the_one_before_stopped():
+@pytest.mark.parametrize("order", [0, 1])
+def test_a_plan_goes_on_where_the_one_before_stopped(order):
     """Executes a plan that no candidate disturbs; NumPy moves its knots on, and holds the last one."""
     lq = random_lq(0, T=9, n=2, m=1)
-    knots, at = np.array([0.0, 0.8, -0.4]), np.array([0.0, 4.0, 8.0])
+    knots, every = np.array([0.0, 0.8, -0.4]), (3, 2)[order]
     search = sampling.start(knots[:, None], 0.0)
-    state, key = jnp.asarray(lq["x_0"]), jax.random.key(0)
-    states, actions = sampling.control(lq_problem(lq, np.inf), state, search, 9, 8, 2, key, Options(samples=1))
+    state, key, options = jnp.asarray(lq["x_0"]), jax.random.key(0), Options(samples=1, order=order)
+    states, actions = sampling.control(lq_problem(lq, np.inf), state, search, 9, 6, every, key, options)
+    at = np.array([0.0, 4.0, 8.0])
     x = lq["x_0"]
-    for t in range(8):
-        if t and t % 2 == 0:
-            knots = np.interp(at + 2, at, knots)
-        np.testing.assert_allclose(actions[t], [np.interp(t % 2, at, knots)], atol=1e-9)
+    for t in range(6):
+        if t and t % every == 0:
+            knots = np.interp(at + 2, at, knots) if order else np.append(knots[1:], knots[-1])
+        expected = np.interp(t % every, at, knots) if order else knots[0]
+        np.testing.assert_allclose(actions[t], [expected], atol=1e-9)
         np.testing.assert_allclose(states[t], x, atol=1e-9)
         x = lq["A"] @ x + lq["B"] @ actions[t]
-    np.testing.assert_allclose(states[8], x, atol=1e-9)
+    np.testing.assert_allclose(states[6], x, atol=1e-9)
 
 
 def test_settings_that_make_no_sense_are_refused():
@@ -168,12 +230,22 @@ def test_settings_that_make_no_sense_are_refused():
         ({"update": "best"}, "update: got 'best', expected one of predictive, cross_entropy, mppi"),
         ({"order": 2}, "order: got 2, expected one of 0, 1, 3"),
         ({"update": "cross_entropy", "samples": 4}, "elites: got 8, expected 2 to samples = 4"),
+        ({"samples": 0}, "samples: got 0, expected at least 1"),
+        ({"temperature": 0.0}, r"temperature: got 0\.0, expected more than 0"),
+        ({"deviation_min": -1.0}, r"deviation_min: got -1\.0, expected at least 0"),
     ):
         with pytest.raises(ValueError, match=message):
             Options(**settings)
     with pytest.raises(ValueError, match="knots: got 9, expected 1 to 8, the time steps"):
         sampling.basis(0, np.arange(8), 8, 9)
     lq = random_lq(0)
-    with pytest.raises(ValueError, match="every: got 4, expected a divisor of steps = 10, at most horizon = 15"):
-        first = sampling.start(jnp.zeros((3, 2)), 1.0)
-        sampling.control(lq_problem(lq, 1.0), lq["x_0"], first, 15, 10, 4, jax.random.key(0), Options())
+    first = sampling.start(jnp.zeros((3, 2)), 1.0)
+    for steps, every, order, message in (
+        (10, 4, 1, "every: got 4, expected a divisor of steps = 10, at most horizon = 15"),
+        (10, 0, 1, "every: got 0, expected a divisor of steps = 10, at most horizon = 15"),
+        (10, 2, 0, "every: got 2, expected a multiple of 5 time steps, for which a knot is held"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            sampling.control(
+                lq_problem(lq, 1.0), lq["x_0"], first, 15, steps, every, jax.random.key(0), Options(order=order)
+            )
