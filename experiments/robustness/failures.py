@@ -110,7 +110,7 @@ def plan(folder: pathlib.Path) -> Any:
     return simulated.cached(folder / "cache", milx.make("reach_state"), 0, "train", 4, 3, settings)
 
 
-def live(folder: pathlib.Path, at: int, kind: str) -> None:
+def live(folder: pathlib.Path, at: int, kind: str, planning: bool = False) -> None:
     """Lives a life, or goes on with one, and prints its result as JSON."""
     import milx
     from milx.core import commands, pytrees
@@ -119,7 +119,7 @@ def live(folder: pathlib.Path, at: int, kind: str) -> None:
     milx.configure()
     count = disturb(folder, at, kind)
     with commands.command():
-        made = plan(folder) if FLAGS.planning else train(folder)
+        made = plan(folder) if planning else train(folder)
     operations = ctypes.CDLL(None).fail_calls_count() if "FAIL_IN" in os.environ else count[0]
     print(json.dumps({"params": pytrees.fingerprint(made), "operations": operations}))
 
@@ -244,7 +244,7 @@ def fail_once(
 def main(_: list[str]) -> None:
     """Lives undisturbed, then once for each operation."""
     if FLAGS.life is not None:
-        live(pathlib.Path(FLAGS.life), FLAGS.at, FLAGS.kind)
+        live(pathlib.Path(FLAGS.life), FLAGS.at, FLAGS.kind, FLAGS.planning)
         return
     from milx.core import files
     from milx.evaluation import provenance
