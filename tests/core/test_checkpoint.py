@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from absl import logging
 
 from milx.core import checkpoint
 from milx.core.checkpoint import UNVALIDATED, Checkpoints
@@ -132,6 +133,23 @@ def test_an_error_of_the_disk_is_reported_with_its_reason(folder, tmp_path, monk
     monkeypatch.setattr(checkpoints._manager, "save", full)
     assert not checkpoints.save(30, items(30), 0.9, {})
     assert "No space left on device" in reports[0]
+
+
+def test_what_orbax_logs_after_a_save_that_failed_is_not_seen(folder, tmp_path, monkeypatch, caplog):
+    """Logs as a thread of Orbax does that goes on; a save that succeeds leaves logging as it was."""
+    before = logging.get_verbosity()
+    try:
+        checkpoints = Checkpoints(copy(folder, tmp_path / "checkpoints"), report=lambda text: None)
+        logging.set_verbosity(logging.ERROR)
+        assert checkpoints.save(30, items(30), 0.9, {})
+        logging.error("heard")
+        monkeypatch.setattr(checkpoints._manager, "save", full)
+        assert not checkpoints.save(40, items(40), 0.9, {})
+        logging.error("not heard")
+    finally:
+        logging.set_verbosity(before)
+    assert "heard" in caplog.messages
+    assert "not heard" not in caplog.messages
 
 
 def test_checkpoints_without_checksums_load(folder, tmp_path):
