@@ -8,6 +8,7 @@ The other tables are `small` (32x40 pixels), `baselines`, `ladder` and `relative
 of their rows changes. Stopped and started again it goes on with its last checkpoint.
 """
 
+import pathlib
 import statistics
 from typing import Any
 
@@ -23,6 +24,8 @@ import milx
 for _name in ("seeds", "show", "out", "rows"):  # the others of options.py do nothing here
     flags.declare_key_flag(_name)
 _TABLE = flags.DEFINE_enum("table", "results", list(TABLES), "Which table.")
+RESULTS = pathlib.Path(__file__).parents[1] / "results" / "paper_results"
+"""The folder of the table `results`."""
 _SEED = flags.DEFINE_integer("first_seed", 0, "The first of the seeds.")
 _CURVES = flags.DEFINE_string("curves", None, "Where to draw the learning curves; default nowhere.")
 
@@ -31,16 +34,22 @@ def main(_: list[str]) -> None:
     """Runs what is missing and prints a table."""
     milx.configure()
     rows, folder = chosen(TABLES[_TABLE.value]), options.folder(f"paper_{_TABLE.value}")
+    trained = {} if options.SHOW.value else own(_TABLE.value, rows)
     runners: dict[str, cells.Cells] = {}
     for seed in range(_SEED.value, _SEED.value + options.SEEDS.value):
-        for name, row in {} if options.SHOW.value else rows.items():
+        for name, row in trained.items():
             named = {f"{name}-{shots}-{seed}": configure(row, shots, seed) for shots in row.shots}
             tasks = configure(row, 1, seed).data.tasks
             runners.setdefault(row.env, cells.Cells(folder, tasks)).run(named)
-    found = cells.read(folder)
+    found = cells.read(RESULTS) | cells.read(folder)
     print(markdown(rows, found))
     if _CURVES.value:
         draw(rows, found, _CURVES.value)
+
+
+def own(table: str, rows: dict[str, Row]) -> dict[str, Row]:
+    """Selects those of a table's rows that are trained for it: other tables show some of the results again."""
+    return {name: row for name, row in rows.items() if table == "results" or name not in TABLES["results"]}
 
 
 def _runs(name: str, shots: int, found: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:

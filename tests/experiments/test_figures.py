@@ -11,6 +11,7 @@ sys.path.insert(0, str(pathlib.Path(__file__).parents[2] / "experiments" / "pape
 import cells
 import figure3
 import pages
+import published
 import published_rows
 import table1
 import table2
@@ -108,6 +109,15 @@ def test_the_ladder_ends_with_fast(env):
     last = [row for name, row in published_rows.TABLES["ladder"].items() if row.env == env][-1]
     config = dataclasses.replace(published_rows.configure(last, 1, seed=0), preset="fast")
     assert config == make_config(env, preset="fast", seed=0)
+
+
+@pytest.mark.parametrize("table", ["ladder", "relatives"])
+def test_a_table_trains_all_of_its_rows_but_those_that_are_results(table):
+    rows = published_rows.TABLES[table]
+    trained = published.own(table, rows)
+    assert [name for name in rows if name not in trained] == ["reach", "push"]
+    assert all(rows[name] == published_rows.TABLES["results"][name] for name in ("reach", "push"))
+    assert published.own("results", published_rows.TABLES["results"]) == published_rows.TABLES["results"]
 
 
 def test_intervals_of_one_table_are_of_one_kind():
