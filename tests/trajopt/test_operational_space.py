@@ -1,0 +1,168 @@
+"""The operational-space law against C MuJoCo's accelerations, in float64."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from mujoco import mjx
+
+from milx.trajopt.ilqr import Problem
+from milx.trajopt.operational_space import OperationalSpace, with_controls
+
+ARM = """
+<mujoco>
+  <compiler angle="radian"/>
+  <option timestep="0.002" gravity="0 0 -9.81"><flag contact="disable"/></option>
+  <default>
+    <geom type="capsule" size="0.03" density="800"/>
+    <joint damping="0.4" armature="0.02" stiffness="0.3" springref="0.2"/>
+  </default>
+  <worldbody>
+    <body name="lift"><joint name="lift" type="slide" axis="0 0 1"/><geom fromto="0 0 0 0 0 0.1"/>
+      <body><joint name="pan" axis="0 0 1"/><geom fromto="0 0 0 0.3 0 0"/>
+        <body pos="0.3 0 0"><joint name="elbow" axis="0 1 0"/><geom fromto="0 0 0 0.3 0 0"/>
+          <body pos="0.3 0 0"><joint name="roll" axis="1 0 0"/><geom fromto="0 0 0 0.1 0 0"/>
+            <body pos="0.1 0 0"><joint name="wrist" axis="0 1 0"/><geom fromto="0 0 0 0.1 0 0"/>
+              <body pos="0.1 0 0"><joint name="yaw" axis="0 0 1"/><geom fromto="0 0 0 0 0.05 0"/>
+                <body pos="0 0.05 0"><joint name="last" axis="1 0 0"/><geom fromto="0 0 0 0.05 0 0"/>
+                  <site name="tip" pos="0.05 0 0.01"/>
+                </body>
+              </body>
+            </body>
+          </body>
+        </body>
+      </body>
+    </body>
+    <body pos="0 0 2"><freejoint/><geom size="0.05" type="sphere"/></body>
+    <site name="fixed"/>
+  </worldbody>
+  <actuator>
+    <motor joint="pan" gear="3"/>
+    <motor joint="lift" gear="20"/>
+    <position joint="elbow" kp="30" kv="2"/>
+    <velocity joint="roll" kv="5" gear="2"/>
+    <motor joint="wrist" gear="-4"/>
+    <general joint="yaw" gainprm="2" biasprm="0.3 -1 -0.2" biastype="affine"/>
+    <motor joint="last"/>
+  </actuator>
+</mujoco>
+"""
+TAU = 0.1
+
+
+@pytest.fixture(autouse=True, scope="module")
+def float64():
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.fixture(scope="module")
+def model():
+    return mujoco.MjModel.from_xml_string(ARM)
+
+
+def moving(model, seed):
+    """Returns a state of the arm, and of the body that floats beside it."""
+    data, rng = mujoco.MjData(model), np.random.default_rng(seed)
+    data.qpos[:7], data.qvel[:] = rng.uniform(-1, 1, 7), rng.uniform(-1, 1, model.nv)
+    data.ctrl[:] = 0
+    mujoco.mj_forward(model, data)
+    return data
+
+
+@pytest.fixture(scope="module")
+def accelerations(model):
+    """Returns the hand's Jacobians [6, nv], and the joints' accelerations [nv] in C MuJoCo, under a law's commands."""
+    plant = mjx.put_model(model)
+
+    def under(
+        law: OperationalSpace, moving: list[mujoco.MjData], wanted: np.ndarray
+    ) -> list[tuple[np.ndarray, np.ndarray]]:
+        command, found = jax.jit(law.command), []
+        for data in moving:
+            data.ctrl[law.actuators] = command(plant, mjx.put_data(model, data), jnp.asarray(wanted))
+            mujoco.mj_forward(model, data)
+            jacobian = np.zeros((6, model.nv))
+            mujoco.mj_jacSite(model, data, jacobian[:3], jacobian[3:], model.site("tip").id)
+            found.append((jacobian, data.qacc))
+        return found
+
+    return under
+
+
+def test_the_hand_gets_the_acceleration_that_the_law_asks_for(model, accelerations):
+    law, wanted = OperationalSpace(model, "tip", time_constant=TAU), np.linspace(-0.5, 0.7, 6)
+    states = [moving(model, seed) for seed in range(3)]
+    for data, (jacobian, found) in zip(states, accelerations(law, states, wanted), strict=True):
+        np.testing.assert_allclose(jacobian @ found, (wanted - jacobian @ data.qvel) / TAU, atol=1e-6)
+
+
+def test_components_that_are_not_controlled_slow_down_with_the_joints_and_regularization_softens(model, accelerations):
+    axes, rho = [0, 1, 2], 0.3
+    data, wanted = moving(model, 0), np.array([0.4, -0.2, 0.1])
+    ((jacobian, found),) = accelerations(OperationalSpace(model, "tip", axes, TAU, rho), [data], wanted)
+    jacobian, speed, inertia = jacobian[axes, :7], data.qvel[:7], np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, inertia)
+    inverse = np.linalg.inv(inertia[:7, :7])
+    weight = np.linalg.inv(jacobian @ inverse @ jacobian.T + rho * np.eye(3))
+    of_hand = inverse @ jacobian.T @ weight @ (wanted - jacobian @ speed) / TAU
+    of_rest = (np.eye(7) - inverse @ jacobian.T @ weight @ jacobian) @ -speed / TAU
+    np.testing.assert_allclose(found[:7], of_hand + of_rest, atol=1e-6)
+
+
+def test_going_toward_a_pose_shortens_the_way_exponentially(model):
+    data, law = moving(model, 0), OperationalSpace(model, "tip")
+    there = moving(model, 1)
+    site = model.site("tip").id
+    goal = jnp.asarray(there.site_xpos[site]), jnp.asarray(there.site_xmat[site].reshape(3, 3))
+    velocity = np.asarray(jax.jit(law.toward)(mjx.put_model(model), mjx.put_data(model, data), *goal, 0.5))
+    np.testing.assert_allclose(velocity[:3], (there.site_xpos[site] - data.site_xpos[site]) / 0.5, atol=1e-9)
+    turn, own, quat, after = np.zeros(4), np.zeros(4), np.zeros(4), np.zeros(9)
+    mujoco.mju_mat2Quat(own, data.site_xmat[site])
+    speed = np.linalg.norm(velocity[3:])
+    mujoco.mju_axisAngle2Quat(turn, velocity[3:] / speed, 0.5 * speed)
+    mujoco.mju_mulQuat(quat, turn, own)
+    mujoco.mju_quat2Mat(after, quat)
+    np.testing.assert_allclose(after, there.site_xmat[site], atol=1e-9)
+
+
+def test_a_problem_in_other_controls_costs_what_its_actions_cost():
+    gain = jnp.array([[2.0], [-1.0]])
+    problem = Problem(
+        dynamics=lambda x, u: x + u,
+        running_residual=lambda x, u, t: jnp.concatenate([x, u * t]),
+        terminal_residual=lambda x: 3.0 * x,
+        control_low=jnp.full(2, -1.0),
+        control_high=jnp.full(2, 1.0),
+    )
+    changed = with_controls(problem, lambda x, v: gain @ v - 0.1 * x, jnp.array([-2.0]), jnp.array([2.0]))
+    x, v, t = jnp.array([0.5, -0.3]), jnp.array([0.8]), jnp.asarray(2)
+    u = jnp.array([1.0, -0.77])  # 1.55 is clipped
+    np.testing.assert_allclose(changed.dynamics(x, v), x + u, atol=1e-12)
+    np.testing.assert_allclose(changed.running_residual(x, v, t), jnp.concatenate([x, 2 * u]), atol=1e-12)
+    np.testing.assert_allclose(changed.terminal_residual(x), 3 * x, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("change", "site", "message"),
+    [
+        (("", ""), "hand", "site: got 'hand', expected one of fixed, tip"),
+        (("", ""), "fixed", "site: got one that no joint moves"),
+        (('<motor joint="last"/>', ""), "tip", "joint 'last': got 0 actuators, expected one"),
+        (('<motor joint="last"/>', '<motor joint="last"/><motor joint="last"/>'), "tip", "got 2 actuators"),
+        (
+            ('<motor joint="last"/>', '<damper joint="last" ctrlrange="0 1"/>'),
+            "tip",
+            "joint 'last': expected an actuator with a",
+        ),
+        (
+            ('name="last" axis="1 0 0"', 'name="last" type="ball"'),
+            "tip",
+            "joint 'last': got mjJNT_BALL, expected a hinge",
+        ),
+    ],
+)
+def test_what_the_law_cannot_drive_is_named(change, site, message):
+    with pytest.raises(ValueError, match=message):
+        OperationalSpace(mujoco.MjModel.from_xml_string(ARM.replace(*change) if change[0] else ARM), site)
