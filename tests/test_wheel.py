@@ -45,6 +45,7 @@ def installed(tmp_path_factory):
     return run, site
 
 
+@pytest.mark.slow
 def test_the_policies_that_ship_act(installed):
     run, site = installed
     done = run("-c", USE)
@@ -68,6 +69,7 @@ def test_the_wheel_is_reproducible(installed, tmp_path):
     assert wheels[0] == wheels[1]
 
 
+@pytest.mark.slow
 def test_launchers_start(installed):
     run, _ = installed
     done = run("-m", "milx.train", "--config.train.steps=7")

@@ -53,7 +53,11 @@ def make_policy(method="mil", **settings):
 
 @pytest.mark.parametrize(
     ("arguments", "shots"),
-    [({}, 1), ({"given": "video", "inner_steps": 2}, 2), ({"method": "lstm"}, 2)],
+    [
+        ({}, 1),
+        pytest.param({"given": "video", "inner_steps": 2}, 2, marks=pytest.mark.slow),
+        pytest.param({"method": "lstm"}, 2, marks=pytest.mark.slow),
+    ],
     ids=["mil", "from two videos alone, in hindsight", "lstm, two shots"],
 )
 def test_another_process_gets_the_same_actions(tmp_path, arguments, shots):

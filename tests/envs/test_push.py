@@ -128,6 +128,7 @@ def test_the_controller_pushes_most_objects_to_the_goal_in_spite_of_noise(env, s
     assert jax.jit(jax.vmap(env.success))(tasks, states).mean() > 0.9
 
 
+@pytest.mark.slow
 def test_a_tactic_is_how_far_to_the_side_of_the_objects_center_the_hand_meets_it(env, shown, monkeypatch):
     """Measures to the left of the hand's view of the goal. Of 32 means under noise, 4 mm are three deviations."""
     tasks, _, _ = shown

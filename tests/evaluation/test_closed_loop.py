@@ -90,6 +90,7 @@ class Replay(Method):
         return jnp.zeros((), jnp.int32)
 
 
+@pytest.mark.slow
 def test_table_is_the_same_for_batches_of_two_and_three_and_for_tasks_adapted_one_by_one(trained, monkeypatch):
     env, key, config = trained.run.env, jax.random.key(5), EvalConfig(trials=24, shots=1, batch=3)
 
@@ -181,6 +182,7 @@ def test_programs_compiled_ahead_are_found(trained, caplog):
         assert compiled(caplog, *names) == [False, False]
 
 
+@pytest.mark.slow
 def test_listening_and_filming_find_their_programs_compiled(trained, caplog):
     """A method and an environment of its own: nothing of them is compiled yet."""
     method, env, config = dataclasses.replace(trained.run.method), Reach((8, 10)), trained.config.evaluation

@@ -103,7 +103,7 @@ def test_the_latest_observation_of_a_history_is_what_there_is_without_one(folder
 
 @pytest.fixture(
     scope="module",
-    params=["mil", *(pytest.param(method, marks=pytest.mark.slow) for method in ("contextual", "lstm"))],
+    params=[pytest.param(method, marks=pytest.mark.slow) for method in ("mil", "contextual", "lstm")],
 )
 def run(request, cache, folder, tmp_path_factory):
     config = recorded.config_for(folder, request.param, "cpu")

@@ -60,7 +60,12 @@ VARIANTS = {
 }
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
+_SLOW = ("two steps, two heads, goal, learned rates", "learned loss over time, two steps")
+
+
+@pytest.mark.parametrize(
+    "variant", [pytest.param(name, marks=[pytest.mark.slow] if name in _SLOW else []) for name in VARIANTS]
+)
 def test_meta_gradient_is_that_of_finite_differences(batch, variant):
     network, config = VARIANTS[variant]
     method, params = build(network, **config)

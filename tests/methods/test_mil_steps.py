@@ -276,6 +276,7 @@ def test_mixed_precision_keeps_the_meta_gradient_and_its_type(batch):
     assert 1e-5 < distance < 0.05
 
 
+@pytest.mark.slow
 def test_rematerialization_keeps_the_meta_gradient_and_less_memory(batch):
     (plain, params), (frugal, _) = build(), build({"rematerialise": True})
     found, expected = (jax.jit(jax.grad(lambda p, m=m: m.loss(p, batch)[0]))(params) for m in (frugal, plain))

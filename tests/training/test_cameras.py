@@ -92,6 +92,7 @@ def test_features_are_those_of_each_camera_side_by_side(share):
     np.testing.assert_allclose(output.action, hidden @ last["kernel"] + last["bias"], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_goal_head_looks_at_the_first_camera(policy):
     """Changes one camera's image at a time."""
     demo, params = random_demo(6), policy.params["policy"]
@@ -107,6 +108,7 @@ def test_the_goal_head_looks_at_the_first_camera(policy):
     assert np.abs(say({**demo.image, "scene": 255 - demo.image["scene"]})[0] - goal).max() > 1e-4
 
 
+@pytest.mark.slow
 def test_an_exported_policy_sees_both_cameras(policy, demos, tmp_path):
     export(policy, tmp_path / "exported")
     alone, demo = standalone.Policy(tmp_path / "exported"), demos[0][0]
@@ -120,6 +122,7 @@ def test_an_exported_policy_sees_both_cameras(policy, demos, tmp_path):
         alone.act(learned, image={"hand": seen["hand"]}, state=demo.state[0])
 
 
+@pytest.mark.slow
 def test_images_of_the_cameras_own_size_are_shrunk_as_at_import(policy, demos, tmp_path):
     """Compares an export with Pillow's filter, and with the policy; sizes of other proportions are refused."""
     export(policy, tmp_path / "exported")
@@ -140,6 +143,7 @@ def test_images_of_the_cameras_own_size_are_shrunk_as_at_import(policy, demos, t
     assert alone.metadata == {"fps": 20, "state_names": ["x", "y", "z"], "action_names": ["dx", "dy"]}
 
 
+@pytest.mark.slow
 def test_cameras_that_lack_or_do_not_fit_are_named(policy, demos):
     demo = demos[0][0]
     for image, message in (

@@ -271,6 +271,7 @@ def run_with_losses(folder, workdir, monkeypatch, spoil):
     return RecordedRun(config, workdir, console), console
 
 
+@pytest.mark.slow
 def test_updates_that_are_not_finite_are_skipped_counted_and_named(folder, tmp_path, monkeypatch):
     """Spoils one training task of thirty, about one batch of two in fifteen; no parameter sees it."""
     run, console = run_with_losses(folder, tmp_path, monkeypatch, lambda n: jnp.where(n == 17, jnp.nan, 1.0))

@@ -123,6 +123,7 @@ class Turning(Reach):
         return (x < 0.1) & (states.qpos[-1, 0] * jnp.sign(y) > 0.01)
 
 
+@pytest.mark.slow
 def test_the_controller_gets_the_first_tactic_that_succeeds_in_rehearsal():
     env, keys = Turning((8, 10)), jax.random.split(jax.random.key(3), 24)
     tasks = jax.vmap(env.sample_task, in_axes=(0, None))(keys, "train")

@@ -74,6 +74,7 @@ def test_euler_step_matches_transition_fd(trajectory):
         np.testing.assert_allclose(values[t], mujoco_step(model, x, u, 1), atol=1e-12)
 
 
+@pytest.mark.slow
 def test_runge_kutta_substeps_match_differences_of_mujoco(trajectory):
     model = mujoco.MjModel.from_xml_string(ARM.format(integrator="RK4"))
     (A, B), values = jax.jit(lambda x, u: linearize(mjx_dynamics(model, SUBSTEPS), x, u))(*trajectory)
