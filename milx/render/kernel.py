@@ -1,7 +1,7 @@
 """The same image in one GPU kernel: rays, nearest hit and lighting of a tile of pixels, without leaving the registers.
 
-The arithmetic is that of `raycast` and `shade`, the readable reference; this file only arranges it for Pallas. A tile
-of pixels passes over every geom whose bounding ball lies outside the pyramid that the tile sees.
+The arithmetic is that of `raycast`, `normals` and `shade`, the readable reference; this file only arranges it for
+Pallas. A tile of pixels passes over every geom whose bounding ball lies outside the pyramid that the tile sees.
 """
 
 import functools
@@ -14,7 +14,7 @@ import numpy as np
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton
 
-from milx.render import raycast, shade, textures
+from milx.render import normals, raycast, shade, textures
 from milx.render.raycast import Kind
 from milx.render.textures import Textures
 
@@ -146,7 +146,7 @@ def _paint_tile(geoms, lights, image, *, ranges, view) -> None:
     distance, winner = best
     hit = distance < jnp.inf
     point = tuple(jnp.where(hit, distance, 1.0) * x for x in rays)
-    normal = raycast.surface_normal(geoms[winner, _KIND], affine(winner), geoms[winner, _STRETCH], point)
+    normal = normals.surface_normal(geoms[winner, _KIND], affine(winner), geoms[winner, _STRETCH], point)
     rgb = tuple(geoms[winner, _RGB + i] for i in range(3))
     if geoms.shape[1] > _FAMILY:
         second = tuple(geoms[winner, _SECOND + i] for i in range(3))

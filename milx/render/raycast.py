@@ -1,12 +1,13 @@
-"""Ray casting: the nearest geom for every pixel, then the surface where its ray arrives.
+"""Ray casting: the nearest geom for every pixel.
 
 An affine map takes the camera frame to each geom's own frame, scaled so that a sphere, an ellipsoid, a box, a cylinder
 and a plane all become the unit shape of their kind; only the capsule keeps a parameter, its half-length in radii. A
-distance along a ray is the same in every affine frame, and a normal is a gradient, which the transposed map carries
-back. Rays have unit length along the optical axis, so the distance along a ray is the depth of the pixel.
+distance along a ray is the same in every affine frame. Rays have unit length along the optical axis, so the distance
+along a ray is the depth of the pixel.
 
-Only the point where a ray enters a shape counts, as in MuJoCo's renderer, which culls back faces: a camera inside a
-geom sees out of it, a plane is seen from its front only, and no convex geom can throw a shadow on itself.
+Only the point where a ray enters a primitive counts, as in MuJoCo's renderer, which culls back faces: a camera inside a
+geom sees out of it, a plane is seen from its front only, and no convex geom can throw a shadow on itself. The triangles
+of meshes are seen from both sides (`meshes.py`).
 
 `G` denotes the geoms and `P` the pixels. A vector per pixel is a tuple of three [P] arrays, so that XLA fuses the
 arithmetic into loops over the pixels.
@@ -21,20 +22,22 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-Vector = tuple[jax.Array, ...]
+from milx.render import meshes
+from milx.render.meshes import Meshes, Vector
 
 # Divisors are kept this far from zero: a ray parallel to a face meets it very far away, and never at NaN.
-_TINY = 1e-12
+TINY = 1e-12
 
 
 class Kind(enum.IntEnum):
-    """The unit shapes: every primitive MuJoCo geom is an affine image of one of them."""
+    """The unit shapes: every primitive MuJoCo geom is an affine image of one of them. Meshes keep their size."""
 
     PLANE = 0  # |x|, |y| <= 1 and z = 0, seen from z > 0
     BALL = 1  # |p| <= 1
     CAPSULE = 2  # within 1 of the segment |z| <= stretch
     CYLINDER = 3  # x^2 + y^2 <= 1 and |z| <= 1
     BOX = 4  # |x|, |y|, |z| <= 1
+    MESH = 5  # triangles, `meshes.py`
 
 
 KIND_OF_GEOM = {
@@ -44,6 +47,7 @@ KIND_OF_GEOM = {
     int(mujoco.mjtGeom.mjGEOM_CAPSULE): Kind.CAPSULE,
     int(mujoco.mjtGeom.mjGEOM_CYLINDER): Kind.CYLINDER,
     int(mujoco.mjtGeom.mjGEOM_BOX): Kind.BOX,
+    int(mujoco.mjtGeom.mjGEOM_MESH): Kind.MESH,
 }
 
 # The columns of `geom_size` that scale each axis of the unit shape, by geom type; none along the normal of a plane.
@@ -106,7 +110,14 @@ def rows_of(affine: jax.Array) -> tuple[Vector, ...]:
     return tuple(tuple(row) for row in affine)
 
 
-def enter(kind: Kind, rows: tuple[Vector, ...], stretch: jax.Array, start: Vector | None, ray: Vector) -> jax.Array:
+def enter(
+    kind: Kind,
+    rows: tuple[Vector, ...],
+    stretch: jax.Array,
+    start: Vector | None,
+    ray: Vector,
+    mesh: tuple[Meshes, jax.Array] | None = None,
+) -> jax.Array:
     """Computes the distance at which rays enter one geom; infinite if they do not.
 
     Args:
@@ -115,14 +126,19 @@ def enter(kind: Kind, rows: tuple[Vector, ...], stretch: jax.Array, start: Vecto
         stretch: of its map.
         start: where the rays start, in the camera frame; None for the camera itself.
         ray: their directions in the camera frame.
+        mesh: for a mesh, the hierarchies and where its own begins.
     """
     o = tuple(row[3] if start is None else row[3] + dot(row[:3], start) for row in rows)
-    return _ENTER[kind](o, tuple(dot(row[:3], ray) for row in rows), stretch)
+    d = tuple(dot(row[:3], ray) for row in rows)
+    if kind == Kind.MESH:
+        assert mesh is not None
+        return meshes.meet(*mesh, o, d, fronts=start is not None)[0]
+    return _ENTER[kind](o, d, stretch)
 
 
 def _slab(o: jax.Array, d: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Computes the distances at which a ray enters and leaves |coordinate| <= 1."""
-    inverse = 1 / jnp.where(jnp.abs(d) < _TINY, _TINY, d)
+    inverse = 1 / jnp.where(jnp.abs(d) < TINY, TINY, d)
     middle = -o * inverse
     return middle - jnp.abs(inverse), middle + jnp.abs(inverse)
 
@@ -133,7 +149,7 @@ def _round(o: Vector, d: Vector) -> tuple[jax.Array, jax.Array, jax.Array]:
     Measured from the ray's closest point to the center, which keeps float32 accurate for small shapes far away, where
     the textbook discriminant cancels.
     """
-    a = jnp.maximum(dot(d, d), _TINY)
+    a = jnp.maximum(dot(d, d), TINY)
     middle = -dot(o, d) / a
     closest = tuple(x + middle * y for x, y in zip(o, d, strict=True))
     inside = 1 - dot(closest, closest)
@@ -143,7 +159,7 @@ def _round(o: Vector, d: Vector) -> tuple[jax.Array, jax.Array, jax.Array]:
 
 def _enter_plane(o: Vector, d: Vector, stretch: jax.Array) -> jax.Array:
     """Computes the distance to the front of the unit square."""
-    t = -o[2] / jnp.minimum(d[2], -_TINY)
+    t = -o[2] / jnp.minimum(d[2], -TINY)
     hit = (d[2] < 0) & (jnp.abs(o[0] + t * d[0]) <= 1) & (jnp.abs(o[1] + t * d[1]) <= 1)
     return jnp.where(hit, t, jnp.inf)
 
@@ -195,7 +211,13 @@ def _select(maps: UnitMaps, ids: np.ndarray) -> UnitMaps:
 
 
 def nearest(
-    groups: Mapping[Kind, np.ndarray], maps: UnitMaps, visible: jax.Array, rays: Vector, near: float, far: float
+    groups: Mapping[Kind, np.ndarray],
+    maps: UnitMaps,
+    visible: jax.Array,
+    rays: Vector,
+    near: float,
+    far: float,
+    triangles: Meshes | None = None,
 ) -> tuple[jax.Array, jax.Array]:
     """Finds the geom that each ray from the camera enters first.
 
@@ -210,6 +232,7 @@ def nearest(
         rays: three [P] arrays, directions in the camera frame with z = -1.
         near: m, nothing closer along the optical axis is seen.
         far: m, nothing farther is seen.
+        triangles: of the meshes; None if there is none.
 
     Returns:
         (id [P] int32, -1 where nothing is hit; distance [P] m, infinite where nothing is hit). The bits lent to the id
@@ -224,7 +247,8 @@ def nearest(
 
         def closer(best, geom, kind=kind):
             to_unit, geom_id, shown = geom
-            t = enter(kind, rows_of(to_unit.affine), to_unit.stretch, None, rays)
+            mesh = _mesh_of(triangles, geom_id) if kind == Kind.MESH else None
+            t = enter(kind, rows_of(to_unit.affine), to_unit.stretch, None, rays, mesh)
             bits = (jax.lax.bitcast_convert_type(t, bits_of) & ~id_mask) | geom_id
             return jnp.where(shown & (t > near) & (t < far), jnp.minimum(best, bits), best), None
 
@@ -241,6 +265,7 @@ def blocked(
     start: Vector,
     ray: Vector,
     reach: jax.Array | float,
+    triangles: Meshes | None = None,
 ) -> jax.Array:
     """Tells whether any geom stands in the way: [P] bool.
 
@@ -251,54 +276,21 @@ def blocked(
         start: three [P] arrays, where the rays start, in the camera frame.
         ray: three [P] arrays or scalars, their directions.
         reach: how far to look, in lengths of `ray`.
+        triangles: of the meshes; None if there is none.
     """
     found = jnp.zeros(start[0].shape, bool)
     for kind, ids in groups.items():
 
         def meets(found, geom, kind=kind):
-            to_unit, shown = geom
-            t = enter(kind, rows_of(to_unit.affine), to_unit.stretch, start, ray)
+            to_unit, geom_id, shown = geom
+            mesh = _mesh_of(triangles, geom_id) if kind == Kind.MESH else None
+            t = enter(kind, rows_of(to_unit.affine), to_unit.stretch, start, ray, mesh)
             return found | (shown & (t > 0) & (t < reach)), None
 
-        found, _ = jax.lax.scan(meets, found, (_select(maps, ids), visible[ids]))
+        found, _ = jax.lax.scan(meets, found, (_select(maps, ids), jnp.asarray(ids), visible[ids]))
     return found
 
 
-def normals(groups: Mapping[Kind, np.ndarray], maps: UnitMaps, geom_id: jax.Array, point: Vector) -> Vector:
-    """Computes the unit normals of the surfaces, three [P] arrays in the camera frame.
-
-    Args:
-        groups: static geom ids by kind.
-        maps: of all geoms.
-        geom_id: [P] int32, the geom that each point lies on. Any point gives finite values.
-        point: three [P] arrays, m, in the camera frame.
-    """
-    kind_of_geom = np.zeros(maps.stretch.shape, np.int32)
-    for kind, ids in groups.items():
-        kind_of_geom[ids] = kind
-    entries = maps.affine.reshape(-1, 12)[geom_id]
-    rows = tuple(tuple(entries[:, 4 * i + j] for j in range(4)) for i in range(3))
-    return surface_normal(jnp.asarray(kind_of_geom)[geom_id], rows, maps.stretch[geom_id], point)
-
-
-def surface_normal(kind: jax.Array, rows: tuple[Vector, ...], stretch: jax.Array, point: Vector) -> Vector:
-    """Computes unit normals at points on geoms of these kinds and maps, all of which are arrays over the points."""
-    local = tuple(row[3] + dot(row[:3], point) for row in rows)
-    gradient = _gradient(kind, stretch, local)
-    normal = tuple(dot(column, gradient) for column in tuple(zip(*rows, strict=True))[:3])
-    inverse = jax.lax.rsqrt(jnp.maximum(dot(normal, normal), _TINY))
-    return tuple(inverse * component for component in normal)
-
-
-def _gradient(kind: jax.Array, stretch: jax.Array, point: Vector) -> Vector:
-    """Computes the direction in which a unit shape's implicit function grows fastest, at a point of its surface."""
-    x, y, z = point
-    # The faceted shapes: outwards on the face that the point is farthest out along.
-    on_side = jnp.abs(z) < jnp.where(kind == Kind.BOX, jnp.maximum(jnp.abs(x), jnp.abs(y)), jnp.sqrt(x * x + y * y))
-    skip_x = (kind == Kind.BOX) & (jnp.abs(x) < jnp.abs(y))
-    skip_y = (kind == Kind.BOX) & ~skip_x
-    faceted = (jnp.where(on_side & ~skip_x, x, 0.0), jnp.where(on_side & ~skip_y, y, 0.0), jnp.where(on_side, 0.0, z))
-    # The round shapes: away from the nearest point of the core, which is the center or a capsule's axis.
-    core = jnp.where(kind == Kind.CAPSULE, jnp.clip(z, -stretch, stretch), 0.0)
-    solid = (jnp.where(kind >= Kind.CYLINDER, a, b) for a, b in zip(faceted, (x, y, z - core), strict=True))
-    return tuple(jnp.where(kind == Kind.PLANE, a, b) for a, b in zip((0.0, 0.0, 1.0), solid, strict=True))
+def _mesh_of(triangles: Meshes | None, geom_id: jax.Array) -> tuple[Meshes, jax.Array]:
+    assert triangles is not None
+    return triangles, jnp.asarray(triangles.root)[geom_id]

@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 from milx.core.mjx import mjx
-from milx.render import raycast, shade, textures
+from milx.render import meshes, normals, raycast, shade, textures
 from milx.render.textures import Textures
 
 _DIRECTIONAL = int(mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
@@ -91,6 +91,8 @@ class Renderer:
         self._model = model
         self._near, self._far = (float(edge * model.stat.extent) for edge in (model.vis.map.znear, model.vis.map.zfar))
         self._groups = _group_geoms(model)
+        shown = self._groups.get(raycast.Kind.MESH)
+        self._meshes = None if shown is None else meshes.of_model(model, shown)
         _check_lights(model)
         self._shadows = shadows
         self._materials = _materials(model)
@@ -136,12 +138,12 @@ class Renderer:
         maps = raycast.unit_maps(self._model.geom_type, *_geometry(scene))
         visible = scene.geom_rgba[:, 3] > 0
         rays = tuple(jnp.asarray(ray, scene.geom_xpos.dtype) for ray in self._rays)
-        geom_id, distance = raycast.nearest(self._groups, maps, visible, rays, self._near, self._far)
+        geom_id, distance = raycast.nearest(self._groups, maps, visible, rays, self._near, self._far, self._meshes)
         hit = geom_id >= 0
         # Where nothing is hit any finite point will do, but infinity would turn into NaN in the gradients.
         point = tuple(jnp.where(hit, distance, 1.0) * ray for ray in rays)
         winner = jnp.maximum(geom_id, 0)
-        normal = raycast.normals(self._groups, maps, winner, point)
+        normal = normals.at_points(self._groups, maps, winner, point, self._meshes)
 
         rgba, made_of = scene.geom_rgba[winner], jnp.asarray(self._materials, float)[winner]
         rgb = tuple(rgba[:, i] for i in range(3))
@@ -164,8 +166,11 @@ class Renderer:
         )
 
     def pixels(self, scene: Scene) -> jax.Array:
-        """Draws the image alone, [H, W, 3] uint8, without gradients; on a GPU in one kernel if no shadows fall."""
-        if jax.default_backend() != "gpu" or self._shadows:
+        """Draws the image alone, [H, W, 3] uint8, without gradients; on a GPU in one kernel if no shadows fall.
+
+        The kernel knows no meshes.
+        """
+        if jax.default_backend() != "gpu" or self._shadows or self._meshes is not None:
             return to_uint8(self.render(scene).color)
         return self.paint(scene)
 
@@ -187,7 +192,8 @@ class Renderer:
     def _in_shadow(self, maps, visible, point, path, w) -> jax.Array:
         """Tells whether a geom stands between the points and a light: [P] bool."""
         path = jax.lax.stop_gradient(path)
-        return raycast.blocked(self._groups, maps, visible, point, path, jnp.where(w > 0, 1.0, self._far))
+        reach = jnp.where(w > 0, 1.0, self._far)
+        return raycast.blocked(self._groups, maps, visible, point, path, reach, self._meshes)
 
     def _lights(self, scene: Scene) -> dict[bool, shade.Lights]:
         """Groups the lights, in the camera frame, by whether they cast shadows; the headlight, last, casts none."""
@@ -275,7 +281,7 @@ def _group_geoms(model: mujoco.MjModel) -> dict[raycast.Kind, np.ndarray]:
     """Groups the ids of the shown geoms by kind, the largest group last as `raycast.nearest` prefers.
 
     Raises:
-        ValueError: a shown geom is no primitive, or no geom is shown.
+        ValueError: a shown geom is neither a primitive nor a mesh, or no geom is shown.
     """
     kinds: dict[raycast.Kind, list[int]] = {}
     for i in np.flatnonzero(model.geom_group < _SHOWN_GROUPS):
@@ -284,7 +290,7 @@ def _group_geoms(model: mujoco.MjModel) -> dict[raycast.Kind, np.ndarray]:
             name = mujoco.mjtGeom(geom_type).name
             raise ValueError(
                 f"geom_type={name} of geom {i} {model.geom(i).name!r}: expected a plane, sphere, capsule, ellipsoid, "
-                f"cylinder or box, or a geom_group of {_SHOWN_GROUPS} or more, which is not shown"
+                f"cylinder, box or mesh, or a geom_group of {_SHOWN_GROUPS} or more, which is not shown"
             )
         kinds.setdefault(raycast.KIND_OF_GEOM[geom_type], []).append(int(i))
     if not kinds:

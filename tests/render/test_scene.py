@@ -124,15 +124,22 @@ def with_mesh(group: int) -> mujoco.MjModel:
         <geom size=".1"/><geom name="odd" type="mesh" mesh="m" group="{group}"/></worldbody></mujoco>""")
 
 
-def test_a_mesh_is_refused_unless_it_is_in_a_hidden_group():
-    with pytest.raises(ValueError, match="geom_type=mjGEOM_MESH of geom 1 'odd': expected a plane, sphere"):
-        Renderer(with_mesh(0), 0, 8, 8)
-    hidden = with_mesh(3)
-    data = mujoco.MjData(hidden)
-    mujoco.mj_forward(hidden, data)
-    renderer = Renderer(hidden, 0, 9, 9)
+@pytest.mark.parametrize(("group", "seen"), [(0, {-1, 1}), (3, {-1, 0})])
+def test_a_mesh_is_seen_unless_it_is_in_a_hidden_group(group, seen):
+    model = with_mesh(group)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    renderer = Renderer(model, 0, 9, 9)
     frame = renderer.render(renderer.scene(data))
-    assert set(np.unique(frame.geom_id)) == {-1, 0}
+    assert set(np.unique(frame.geom_id)) == seen
+
+
+def test_a_height_field_is_refused():
+    model = mujoco.MjModel.from_xml_string("""<mujoco>
+        <asset><hfield name="h" nrow="3" ncol="3" size="1 1 1 .1"/></asset><worldbody><camera pos="0 0 3"/>
+        <geom name="odd" type="hfield" hfield="h"/></worldbody></mujoco>""")
+    with pytest.raises(ValueError, match="geom_type=mjGEOM_HFIELD of geom 0 'odd': expected a plane, sphere"):
+        Renderer(model, 0, 8, 8)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,175 @@
+"""Triangle meshes: hierarchies of bounding boxes, built on the host, and the way of rays through them.
+
+The triangles of a mesh are divided in two at the median of their centers, along the axis on which those spread most,
+and so on until a leaf has LEAF of them or fewer. The nodes are numbered depth first: a node's first child follows it,
+and `skip` is the node after its last descendant. A ray begins at the root of a mesh. If it enters a node's box before
+the nearest triangle that it has found, it goes on with the next node, and otherwise with `skip`; it ends with the
+root's `skip`. So there is no stack, and every ray has its own place in the hierarchy.
+
+A ray o + t d meets a triangle a, a + u, a + v, whose front u x v points to, if
+
+    β, γ >= 0    and    β + γ <= 1,    with    det = -d · (u x v),    s = o - a,
+    t = s · (u x v) / det,    β = -d · (s x v) / det    and    γ = -d · (u x s) / det
+
+(Möller & Trumbore, "Fast, minimum storage ray-triangle intersection", 1997); through its front if det > 0. Meshes of
+robots have some triangles the wrong way around, so a camera sees both sides, as `mj_ray` does. Rays to a light start on
+the surface itself and are stopped by fronts alone.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+Vector = tuple[jax.Array, ...]
+LEAF = 2
+"""Triangles of a leaf."""
+_TINY = 1e-12
+
+
+class Meshes(NamedTuple):
+    """The hierarchies of all meshes of a model, one after the other; N nodes, F triangles, G geoms.
+
+    Attributes:
+        box: [N, 6] lowest and highest corner (m, in the geom's frame).
+        skip: [N] int32, the node to go on with if the box is not entered.
+        first: [N] int32, a leaf's first triangle; -1 if the node has children.
+        triangle: [F, 3, 3], a, u and v (m). Leaves with fewer than LEAF triangles repeat their last one.
+        root: [G] int32, the node where a geom's mesh begins; 0 for other geoms.
+    """
+
+    box: np.ndarray
+    skip: np.ndarray
+    first: np.ndarray
+    triangle: np.ndarray
+    root: np.ndarray
+
+
+def of_model(model: mujoco.MjModel, geoms: np.ndarray) -> Meshes:
+    """Builds the hierarchies of the meshes of some geoms, each mesh once."""
+    root, nodes = np.zeros(model.ngeom, np.int32), _Nodes()
+    begins: dict[int, int] = {}
+    for geom in geoms:
+        mesh = int(model.geom_dataid[geom])
+        if mesh not in begins:
+            begins[mesh] = len(nodes.box)
+            first, count = model.mesh_faceadr[mesh], model.mesh_facenum[mesh]
+            corners = model.mesh_vert[model.mesh_vertadr[mesh] + model.mesh_face[first : first + count]]
+            nodes.add(corners)
+        root[geom] = begins[mesh]
+    return nodes.arrays(root)
+
+
+class _Nodes:
+    """Nodes as they are made."""
+
+    def __init__(self) -> None:
+        self.box: list[np.ndarray] = []
+        self.skip: list[int] = []
+        self.first: list[int] = []
+        self.corners: list[np.ndarray] = []
+
+    def add(self, corners: np.ndarray) -> None:
+        """Adds the nodes of triangles [F, 3, 3] (their corners)."""
+        node = len(self.box)
+        self.box.append(np.concatenate([corners.min(axis=(0, 1)), corners.max(axis=(0, 1))]))
+        self.skip.append(-1)
+        if len(corners) <= LEAF:
+            self.first.append(LEAF * len(self.corners))
+            self.corners.append(np.concatenate([corners, np.repeat(corners[-1:], LEAF - len(corners), axis=0)]))
+        else:
+            self.first.append(-1)
+            centers = corners.mean(axis=1)
+            half = len(corners) // 2
+            order = np.argpartition(centers[:, np.ptp(centers, axis=0).argmax()], half)
+            self.add(corners[order[:half]])
+            self.add(corners[order[half:]])
+        self.skip[node] = len(self.box)
+
+    def arrays(self, root: np.ndarray) -> Meshes:
+        """Makes arrays of all nodes."""
+        a, b, c = np.moveaxis(np.concatenate(self.corners).astype(float), 1, 0)
+        triangle = np.stack([a, b - a, c - a], axis=1)
+        return Meshes(np.array(self.box), np.array(self.skip, np.int32), np.array(self.first, np.int32), triangle, root)
+
+
+def _cross(a: Vector, b: Vector) -> Vector:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+def _dot(a: Vector, b: Vector) -> jax.Array:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _columns(table: jax.Array) -> Vector:
+    """Splits [P, 3] into three [P]."""
+    return table[:, 0], table[:, 1], table[:, 2]
+
+
+def _meet(triangle: jax.Array, o: Vector, d: Vector, fronts: bool) -> jax.Array:
+    """Computes the distances [P] to triangles [P, 3, 3], or to their fronts; infinite for rays that miss them."""
+    a, u, v = (_columns(triangle[:, i]) for i in range(3))
+    s = tuple(x - y for x, y in zip(o, a, strict=True))
+    normal = _cross(u, v)
+    det = -_dot(d, normal)
+    counts = det > 0 if fronts else det != 0
+    inverse = 1 / jnp.where(counts, det, 1.0)
+    beta, gamma = -_dot(d, _cross(s, v)) * inverse, -_dot(d, _cross(u, s)) * inverse
+    hit = counts & (beta >= 0) & (gamma >= 0) & (beta + gamma <= 1)
+    return jnp.where(hit, _dot(s, normal) * inverse, jnp.inf)
+
+
+def meet(meshes: Meshes, root: jax.Array, o: Vector, d: Vector, fronts: bool) -> tuple[jax.Array, jax.Array]:
+    """Finds the nearest triangle in front of every ray.
+
+    Args:
+        meshes: the hierarchies.
+        root: int32, where to begin, of all rays or [P] of each; as many as there are nodes for no mesh.
+        o: three [P] arrays, where the rays start, in the frame of the mesh (m).
+        d: three [P] arrays, their directions.
+        fronts: whether to pass over triangles that are met from behind.
+
+    Returns:
+        (distance [P] in lengths of d, at least 0, infinite where nothing is met; triangle [P] int32).
+    """
+    every = jnp.broadcast_arrays(*o, *d)
+    o, d = tuple(every[:3]), tuple(every[3:])
+    dtype, count = o[0].dtype, len(meshes.skip)
+    box, triangle = jnp.asarray(meshes.box, dtype), jnp.asarray(meshes.triangle, dtype)
+    skip, first = jnp.asarray(meshes.skip), jnp.asarray(meshes.first)
+    start = jnp.broadcast_to(jnp.asarray(root, jnp.int32), o[0].shape)
+    end = jnp.where(start < count, skip[jnp.minimum(start, count - 1)], start)
+    inverse = tuple(1 / jnp.where(jnp.abs(x) < _TINY, _TINY, x) for x in d)
+
+    def visit(state: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
+        node, nearest, found = state
+        at = jnp.minimum(node, count - 1)
+        low, high = _columns(box[at, :3]), _columns(box[at, 3:])
+        sides = [((low[i] - o[i]) * inverse[i], (high[i] - o[i]) * inverse[i]) for i in range(3)]
+        enters = jnp.maximum(*(jnp.minimum(*sides[i]) for i in (0, 1)))
+        enters = jnp.maximum(enters, jnp.minimum(*sides[2]))
+        leaves = jnp.minimum(*(jnp.maximum(*sides[i]) for i in (0, 1)))
+        leaves = jnp.minimum(leaves, jnp.maximum(*sides[2]))
+        inside = (enters <= leaves) & (leaves >= 0) & (enters < nearest) & (node < end)
+        leaf = first[at] >= 0
+        for number in range(LEAF):
+            index = jnp.maximum(first[at], 0) + number
+            t = _meet(triangle[index], o, d, fronts)
+            nearer = inside & leaf & (t >= 0) & (t < nearest)
+            nearest, found = jnp.where(nearer, t, nearest), jnp.where(nearer, index, found)
+        after = jnp.where(inside & ~leaf, at + 1, skip[at])
+        return jnp.where(node < end, after, node), nearest, found
+
+    nothing = jnp.full(o[0].shape, jnp.inf, dtype), jnp.zeros(o[0].shape, jnp.int32)
+    _, nearest, found = jax.lax.while_loop(lambda state: (state[0] < end).any(), visit, (start, *nothing))
+    return nearest, found
+
+
+def normal(meshes: Meshes, triangle: jax.Array, d: Vector) -> Vector:
+    """Returns normals (m²) of triangles [P], on the side that rays d meet: three [P] arrays in the mesh's frame."""
+    chosen = jnp.asarray(meshes.triangle, d[0].dtype)[triangle]
+    facing = _cross(_columns(chosen[:, 1]), _columns(chosen[:, 2]))
+    side = jnp.where(_dot(facing, d) > 0, -1.0, 1.0)
+    return side * facing[0], side * facing[1], side * facing[2]
