@@ -84,6 +84,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "figure3-push": lambda: figure3.markdown(list(cells.read(RESULTS / "figure3_push").values())),
     "ablations": lambda: ablations.markdown(cells.read(RESULTS / "ablations"), list(ablations.ABLATIONS), seeds=2),
     "meta-world": lambda: board.markdown(board.read()),
+    "meta-world-unseen": lambda: board.markdown(board.read("unseen:make")),
     "benchmarks": lambda: summary.table(list(cells.read(RESULTS / "benchmarks").values())),
 }
 """What makes the table of each name."""
