@@ -66,3 +66,28 @@ def test_a_world_that_cannot_be_started_ends_the_run_before_training(config, tmp
     with pytest.raises(WorldError, match="has no attribute 'no_such_function'"):
         run.train()
     assert not (tmp_path / "run" / "metrics.jsonl").exists()
+
+
+def test_a_policy_with_a_history_is_chosen_in_the_world_extended_and_started_from(config, tmp_path):
+    """Trains in two parts, evaluates the best checkpoint again, and begins another run with its parameters."""
+    config.recorded.history, config.train.steps, folder = 2, 200, tmp_path / "run"
+    make_run(config, folder, QUIET).train()
+    before = read_metrics(folder / "metrics.jsonl")
+    config.train.steps = 400
+    run = make_run(config, folder, QUIET)
+    run.train()
+    lines = read_metrics(folder / "metrics.jsonl")
+    assert lines[: len(before)] == before
+    assert [line["step"] for line in lines if "validation_success" in line] == [200, 400]
+    policy = milx.load(folder)
+    tasks = tasks_of(run.data, "validation", policy)
+    outcomes = evaluate_in(policy, "point_world:make", tasks, controls=["own"], episodes=3, workers=3)
+    checkpoints = Checkpoints(folder / "checkpoints", read_only=True)
+    assert np.mean([outcome.ever for outcome in outcomes]) == checkpoints.score(checkpoints.best) > 0
+    config.train.init, config.train.steps, config.seed = str(folder), 200, 1
+    make_run(config, tmp_path / "next", QUIET).train()
+    first, after = (
+        next(line["loss"] for line in found if "loss" in line)
+        for found in (before, read_metrics(tmp_path / "next" / "metrics.jsonl"))
+    )
+    assert after < first, "what was learned must be there after the first 100 updates"
