@@ -6,14 +6,13 @@ and `skip` is the node after its last descendant. A ray begins at the root of a 
 the nearest triangle that it has found, it goes on with the next node, and otherwise with `skip`; it ends with the
 root's `skip`. So there is no stack, and every ray has its own place in the hierarchy.
 
-A ray o + t d meets a triangle a, a + u, a + v, whose front u x v points to, if
+A ray o + t d meets a triangle a, a + u, a + v if
 
-    β, γ >= 0    and    β + γ <= 1,    with    det = -d · (u x v),    s = o - a,
-    t = s · (u x v) / det,    β = -d · (s x v) / det    and    γ = -d · (u x s) / det
+    β, γ >= 0    and    β + γ <= 1,    with    n = u x v,    det = -d · n,    s = o - a,
+    t = s · n / det,    β = -d · (s x v) / det    and    γ = -d · (u x s) / det
 
-(Möller & Trumbore, "Fast, minimum storage ray-triangle intersection", 1997); through its front if det > 0. Meshes of
-robots have some triangles the wrong way around, so a camera sees both sides, as `mj_ray` does. Rays to a light start on
-the surface itself and are stopped by fronts alone.
+(Möller & Trumbore, "Fast, minimum storage ray-triangle intersection", 1997). Meshes of robots have some triangles the
+wrong way around, so both sides count, as for `mj_ray`. A camera inside a mesh sees its inside.
 """
 
 from typing import NamedTuple
@@ -37,6 +36,7 @@ class Meshes(NamedTuple):
         skip: [N] int32, the node to go on with if the box is not entered.
         first: [N] int32, a leaf's first triangle; -1 if the node has children.
         triangle: [F, 3, 3], a, u and v (m). Leaves with fewer than LEAF triangles repeat their last one.
+        normal: [F, 3], n of unit length; zero for a triangle without an area.
         root: [G] int32, the node where a geom's mesh begins; 0 for other geoms.
     """
 
@@ -44,6 +44,7 @@ class Meshes(NamedTuple):
     skip: np.ndarray
     first: np.ndarray
     triangle: np.ndarray
+    normal: np.ndarray
     root: np.ndarray
 
 
@@ -91,8 +92,10 @@ class _Nodes:
     def arrays(self, root: np.ndarray) -> Meshes:
         """Makes arrays of all nodes."""
         a, b, c = np.moveaxis(np.concatenate(self.corners).astype(float), 1, 0)
-        triangle = np.stack([a, b - a, c - a], axis=1)
-        return Meshes(np.array(self.box), np.array(self.skip, np.int32), np.array(self.first, np.int32), triangle, root)
+        normal = np.cross(b - a, c - a)
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+        skip, first = np.array(self.skip, np.int32), np.array(self.first, np.int32)
+        return Meshes(np.array(self.box), skip, first, np.stack([a, b - a, c - a], axis=1), normal, root)
 
 
 def _cross(a: Vector, b: Vector) -> Vector:
@@ -108,31 +111,31 @@ def _columns(table: jax.Array) -> Vector:
     return table[:, 0], table[:, 1], table[:, 2]
 
 
-def _meet(triangle: jax.Array, o: Vector, d: Vector, fronts: bool) -> jax.Array:
-    """Computes the distances [P] to triangles [P, 3, 3], or to their fronts; infinite for rays that miss them."""
+def _meet(triangle: jax.Array, o: Vector, d: Vector) -> jax.Array:
+    """Computes the distances [P] to triangles [P, 3, 3]; infinite for rays that miss them."""
     a, u, v = (_columns(triangle[:, i]) for i in range(3))
-    s = tuple(x - y for x, y in zip(o, a, strict=True))
-    normal = _cross(u, v)
-    det = -_dot(d, normal)
-    counts = det > 0 if fronts else det != 0
-    inverse = 1 / jnp.where(counts, det, 1.0)
+    s, n = tuple(x - y for x, y in zip(o, a, strict=True)), _cross(u, v)
+    det = -_dot(d, n)
+    inverse = 1 / jnp.where(det != 0, det, 1.0)
     beta, gamma = -_dot(d, _cross(s, v)) * inverse, -_dot(d, _cross(u, s)) * inverse
-    hit = counts & (beta >= 0) & (gamma >= 0) & (beta + gamma <= 1)
-    return jnp.where(hit, _dot(s, normal) * inverse, jnp.inf)
+    hit = (det != 0) & (beta >= 0) & (gamma >= 0) & (beta + gamma <= 1)
+    return jnp.where(hit, _dot(s, n) * inverse, jnp.inf)
 
 
-def meet(meshes: Meshes, root: jax.Array, o: Vector, d: Vector, fronts: bool) -> tuple[jax.Array, jax.Array]:
-    """Finds the nearest triangle in front of every ray.
+def meet(
+    meshes: Meshes, root: jax.Array, o: Vector, d: Vector, least: jax.Array | float
+) -> tuple[jax.Array, jax.Array]:
+    """Finds the nearest triangle that every ray meets from a distance on.
 
     Args:
         meshes: the hierarchies.
-        root: int32, where to begin, of all rays or [P] of each; as many as there are nodes for no mesh.
+        root: int32, where to begin, of all rays or [P] of each; the number of nodes stands for no mesh.
         o: three [P] arrays, where the rays start, in the frame of the mesh (m).
         d: three [P] arrays, their directions.
-        fronts: whether to pass over triangles that are met from behind.
+        least: triangles that are met at a smaller distance (in lengths of d) are passed over.
 
     Returns:
-        (distance [P] in lengths of d, at least 0, infinite where nothing is met; triangle [P] int32).
+        (distance [P] in lengths of d, infinite where nothing is met; triangle [P] int32, there the table's first).
     """
     every = jnp.broadcast_arrays(*o, *d)
     o, d = tuple(every[:3]), tuple(every[3:])
@@ -152,12 +155,12 @@ def meet(meshes: Meshes, root: jax.Array, o: Vector, d: Vector, fronts: bool) ->
         enters = jnp.maximum(enters, jnp.minimum(*sides[2]))
         leaves = jnp.minimum(*(jnp.maximum(*sides[i]) for i in (0, 1)))
         leaves = jnp.minimum(leaves, jnp.maximum(*sides[2]))
-        inside = (enters <= leaves) & (leaves >= 0) & (enters < nearest) & (node < end)
+        inside = (enters <= leaves) & (leaves >= least) & (enters < nearest) & (node < end)
         leaf = first[at] >= 0
         for number in range(LEAF):
             index = jnp.maximum(first[at], 0) + number
-            t = _meet(triangle[index], o, d, fronts)
-            nearer = inside & leaf & (t >= 0) & (t < nearest)
+            t = _meet(triangle[index], o, d)
+            nearer = inside & leaf & (t >= least) & (t < nearest)
             nearest, found = jnp.where(nearer, t, nearest), jnp.where(nearer, index, found)
         after = jnp.where(inside & ~leaf, at + 1, skip[at])
         return jnp.where(node < end, after, node), nearest, found
@@ -168,8 +171,7 @@ def meet(meshes: Meshes, root: jax.Array, o: Vector, d: Vector, fronts: bool) ->
 
 
 def normal(meshes: Meshes, triangle: jax.Array, d: Vector) -> Vector:
-    """Returns normals (m²) of triangles [P], on the side that rays d meet: three [P] arrays in the mesh's frame."""
-    chosen = jnp.asarray(meshes.triangle, d[0].dtype)[triangle]
-    facing = _cross(_columns(chosen[:, 1]), _columns(chosen[:, 2]))
+    """Returns unit normals of triangles [P], on the side that rays d meet: three [P] arrays in the mesh's frame."""
+    facing = _columns(jnp.asarray(meshes.normal, d[0].dtype)[triangle])
     side = jnp.where(_dot(facing, d) > 0, -1.0, 1.0)
     return side * facing[0], side * facing[1], side * facing[2]

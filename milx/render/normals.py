@@ -13,6 +13,9 @@ from milx.render import meshes
 from milx.render.meshes import Meshes
 from milx.render.raycast import TINY, Kind, UnitMaps, Vector, dot
 
+_SEEN = 0.999
+"""From which fraction of its depth on a point may lie again on the triangle on which it has been seen."""
+
 
 def at_points(
     groups: Mapping[Kind, np.ndarray],
@@ -40,7 +43,7 @@ def at_points(
     if triangles is not None:  # the way from the camera to the point leads to the triangle
         root = jnp.where(kinds == Kind.MESH, jnp.asarray(triangles.root)[geom_id], len(triangles.skip))
         ray = tuple(dot(row[:3], point) for row in rows)
-        _, seen = meshes.meet(triangles, root, tuple(row[3] for row in rows), ray, fronts=False)
+        _, seen = meshes.meet(triangles, root, tuple(row[3] for row in rows), ray, _SEEN)
         facing = meshes.normal(triangles, seen, ray)
     return surface_normal(kinds, rows, maps.stretch[geom_id], point, facing)
 

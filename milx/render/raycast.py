@@ -27,10 +27,13 @@ from milx.render.meshes import Meshes, Vector
 
 # Divisors are kept this far from zero: a ray parallel to a face meets it very far away, and never at NaN.
 TINY = 1e-12
+# A shadow falls on a mesh from itself if it is at least this fraction of its diagonal away.
+_OWN = 1e-3
+_DIAGONAL = np.concatenate([-np.eye(3), np.eye(3)])  # of a box [6]
 
 
 class Kind(enum.IntEnum):
-    """The unit shapes: every primitive MuJoCo geom is an affine image of one of them. Meshes keep their size."""
+    """The unit shapes: every primitive MuJoCo geom is an affine image of one of them. Meshes are not scaled."""
 
     PLANE = 0  # |x|, |y| <= 1 and z = 0, seen from z > 0
     BALL = 1  # |p| <= 1
@@ -116,7 +119,7 @@ def enter(
     stretch: jax.Array,
     start: Vector | None,
     ray: Vector,
-    mesh: tuple[Meshes, jax.Array] | None = None,
+    mesh: tuple[Meshes, jax.Array, jax.Array | float] | None = None,
 ) -> jax.Array:
     """Computes the distance at which rays enter one geom; infinite if they do not.
 
@@ -126,13 +129,14 @@ def enter(
         stretch: of its map.
         start: where the rays start, in the camera frame; None for the camera itself.
         ray: their directions in the camera frame.
-        mesh: for a mesh, the hierarchies and where its own begins.
+        mesh: for a mesh, the hierarchies, where its own begins, and from which distance on it counts.
     """
     o = tuple(row[3] if start is None else row[3] + dot(row[:3], start) for row in rows)
     d = tuple(dot(row[:3], ray) for row in rows)
     if kind == Kind.MESH:
         assert mesh is not None
-        return meshes.meet(*mesh, o, d, fronts=start is not None)[0]
+        table, root, least = mesh
+        return meshes.meet(table, root, o, d, least)[0]
     return _ENTER[kind](o, d, stretch)
 
 
@@ -247,7 +251,9 @@ def nearest(
 
         def closer(best, geom, kind=kind):
             to_unit, geom_id, shown = geom
-            mesh = _mesh_of(triangles, geom_id) if kind == Kind.MESH else None
+            mesh = None
+            if kind == Kind.MESH and triangles is not None:
+                mesh = triangles, jnp.asarray(triangles.root)[geom_id], near
             t = enter(kind, rows_of(to_unit.affine), to_unit.stretch, None, rays, mesh)
             bits = (jax.lax.bitcast_convert_type(t, bits_of) & ~id_mask) | geom_id
             return jnp.where(shown & (t > near) & (t < far), jnp.minimum(best, bits), best), None
@@ -283,14 +289,13 @@ def blocked(
 
         def meets(found, geom, kind=kind):
             to_unit, geom_id, shown = geom
-            mesh = _mesh_of(triangles, geom_id) if kind == Kind.MESH else None
+            mesh = None
+            if kind == Kind.MESH and triangles is not None:  # rays that start on a mesh must not meet it there
+                root = jnp.asarray(triangles.root)[geom_id]
+                size = jnp.linalg.norm(jnp.asarray(triangles.box, ray[0].dtype)[root] @ _DIAGONAL)
+                mesh = triangles, root, _OWN * size / jnp.sqrt(dot(ray, ray))
             t = enter(kind, rows_of(to_unit.affine), to_unit.stretch, start, ray, mesh)
             return found | (shown & (t > 0) & (t < reach)), None
 
         found, _ = jax.lax.scan(meets, found, (_select(maps, ids), jnp.asarray(ids), visible[ids]))
     return found
-
-
-def _mesh_of(triangles: Meshes | None, geom_id: jax.Array) -> tuple[Meshes, jax.Array]:
-    assert triangles is not None
-    return triangles, jnp.asarray(triangles.root)[geom_id]

@@ -64,8 +64,9 @@ class Renderer:
     """Renders one camera of a model; pure functions to be used under `jax.jit` and `jax.vmap`.
 
     All geoms in groups 0 to 2 are rendered, as MuJoCo does by default. Near and far planes are MuJoCo's
-    (`visual/map/znear` and `zfar`, in units of the model's extent). The color is differentiable with respect to the
-    colors and the lights; the geometry carries no gradient.
+    (`visual/map/znear` and `zfar`, in units of the model's extent). Meshes have the flat normals of their triangles;
+    MuJoCo's textures are not drawn. The color is differentiable with respect to the colors and the lights; the geometry
+    carries no gradient.
     """
 
     def __init__(
@@ -166,16 +167,24 @@ class Renderer:
         )
 
     def pixels(self, scene: Scene) -> jax.Array:
-        """Draws the image alone, [H, W, 3] uint8, without gradients; on a GPU in one kernel if no shadows fall.
+        """Draws the image alone, [H, W, 3] uint8, without gradients.
 
-        The kernel knows no meshes.
+        On a GPU it is one kernel if no shadows fall and no mesh is shown.
         """
         if jax.default_backend() != "gpu" or self._shadows or self._meshes is not None:
             return to_uint8(self.render(scene).color)
         return self.paint(scene)
 
     def paint(self, scene: Scene, interpret: bool = False) -> jax.Array:
-        """Draws the image in one kernel of a GPU, without shadows; `interpret` runs the kernel anywhere, slowly."""
+        """Draws the image in one kernel of a GPU, without shadows; `interpret` runs the kernel anywhere, slowly.
+
+        Raises:
+            ValueError: if a mesh is shown, which the kernel does not know.
+        """
+        if self._meshes is not None:
+            raise ValueError(
+                f"geoms: got meshes, {len(self._meshes.triangle)} triangles, expected primitives; use render"
+            )
         from milx.render import kernel  # Pallas takes a quarter of a second to import
 
         texture = None if scene.texture is None else _in_camera(scene.texture, scene)
