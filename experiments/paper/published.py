@@ -41,7 +41,8 @@ def main(_: list[str]) -> None:
             named = {f"{name}-{shots}-{seed}": configure(row, shots, seed) for shots in row.shots}
             tasks = configure(row, 1, seed).data.tasks
             runners.setdefault(row.env, cells.Cells(folder, tasks)).run(named)
-    found = cells.read(RESULTS) | cells.read(folder)
+    shared = {} if _TABLE.value == "results" else cells.read(RESULTS)
+    found = shared | cells.read(folder)
     print(markdown(rows, found))
     if _CURVES.value:
         draw(rows, found, _CURVES.value)

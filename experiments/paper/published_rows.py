@@ -226,4 +226,4 @@ TABLES: dict[str, dict[str, Row]] = {
     "ladder": _ladder(),
     "relatives": _RELATIVES,
 }
-"""The rows of every table, by name; a row that is one of the results, too, is trained for those."""
+"""The rows of every table, by name; a row that is one of the results, too, is trained there."""

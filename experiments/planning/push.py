@@ -21,7 +21,7 @@ import milx
 from milx import envs
 from milx.core import files
 from milx.envs.base import State
-from milx.envs.push.env import FINAL_COST, OBJECT_COST, TIP_COST, Push, PushTask
+from milx.envs.push.env import Push, PushTask
 from milx.evaluation import provenance
 from milx.evaluation.intervals import wilson_interval
 from milx.trajopt import sampling
@@ -36,7 +36,6 @@ DEVIATION = (0.3, 0.3, 0.3, 1.0)
 """Standard deviation of the first candidates, in the same units."""
 UPRIGHT = 6.0
 """Rate at which the hand returns to pointing down (1/s)."""
-ACTION_COST = 0.03
 TIME_CONSTANT, REGULARIZATION = 0.06, 1e-2
 NOISE = 0.1
 EVERY = (10, 20)
@@ -63,25 +62,19 @@ class Planner:
         self._law = OperationalSpace(env.mj_model, "tip", time_constant=TIME_CONSTANT, regularization=REGULARIZATION)
 
     def action(self, state: State, velocity: jax.Array) -> jax.Array:
-        """Computes the actions [7], clipped, that move the hand so (velocity [4]) and keep it upright."""
+        """Computes the actions [7], not clipped, that move the hand so (velocity [4]) and keep it upright."""
         tilt = jnp.cross(self.env.hand(state.qpos)[6:9], jnp.array([0.0, 0.0, -1.0]))
         wanted = jnp.concatenate([velocity[:3], UPRIGHT * tilt[:2], velocity[3:]])
         # The objects' masses do not matter to the arm's law.
-        return jnp.clip(self._law.command(self.env.model, self.env.data(state), wanted), *self.env.action_range)
+        return self._law.command(self.env.model, self.env.data(state), wanted)
 
     def problem(self, task: PushTask, start: State) -> Problem:
-        """States the problem of a scene: the paper's reward, squared, in velocities of the hand."""
+        """States the problem of a scene, with the environment's costs, in velocities of the hand."""
         env = self.env
-
-        def running_residual(x: jax.Array, u: jax.Array, t: jax.Array) -> jax.Array:
-            state = start.with_vector(x)
-            place, tip = env.objects(state)[task.target, :2], env.hand(state.qpos)[:2]
-            return jnp.concatenate([OBJECT_COST * place, TIP_COST * (tip - place), ACTION_COST * u])
-
         problem = Problem(
             dynamics=lambda x, u: env.step(task, start.with_vector(x), u).vector,
-            running_residual=running_residual,
-            terminal_residual=lambda x: FINAL_COST * env.objects(start.with_vector(x))[task.target, :2],
+            running_residual=lambda x, u, t: env.running_residual(task, start.with_vector(x), u, t),
+            terminal_residual=lambda x: env.terminal_residual(task, start.with_vector(x)),
             control_low=env.action_range[0],
             control_high=env.action_range[1],
         )
@@ -107,7 +100,7 @@ class Planner:
 
         def one(task: PushTask, start: State, search: Search, key: jax.Array) -> jax.Array:
             def plant(x: jax.Array, velocity: jax.Array, key: jax.Array) -> jax.Array:
-                action = self.action(start.with_vector(x), velocity)
+                action = jnp.clip(self.action(start.with_vector(x), velocity), *self.env.action_range)
                 return self.env.step(task, start.with_vector(x), action + NOISE * jax.random.normal(key, (7,))).vector
 
             horizon, problem = self.env.horizon, self.problem(task, start)

@@ -1,7 +1,7 @@
 """Operational space: a hand's velocity as the control, for planners that need not know how a robot is driven.
 
 A site of the model, on an arm of n joints, moves with the velocity v = J q̇, of which k components (of three linear and
-three angular ones) are controlled. The law asks for accelerations of the hand and of the joints,
+three angular ones) are controlled. The law asks for accelerations of the hand, but for J̇ q̇, and of the joints,
 
     a = (v* - v) / τ        q̈_0 = -q̇ / τ,
 
@@ -11,10 +11,11 @@ less those of springs and dampers):
     Λ = (J M⁻¹ Jᵀ + ρ I)⁻¹        N = I - Jᵀ Λ J M⁻¹
     torque = Jᵀ Λ a + N M q̈_0 + h.
 
-For ρ = 0 the joints' accelerations q̈ then satisfy J q̈ = a, whatever q̈_0 is, unless an actuator saturates or the arm
-touches something (Khatib 1987, with the dynamically consistent inverse M⁻¹ Jᵀ Λ). ρ bounds the torques near singular
-poses. Joints beyond the hand, such as fingers, count as locked, and have commands of their own. The actuator of joint j
-exerts gear_j (g_j u_j + b_j0 + b_j1 l_j + b_j2 l̇_j) at length l_j = gear_j q_j, so that the command is
+For ρ = 0 the joints' accelerations q̈ then satisfy J q̈ = a, whatever q̈_0 is, unless a limit, a constraint, friction or
+contact stands in the way (Khatib 1987, with the dynamically consistent inverse M⁻¹ Jᵀ Λ; he compensates J̇ q̇, too, which
+is small at a hand's speeds). ρ bounds the torques near singular poses, where J M⁻¹ Jᵀ has no inverse. Joints beyond the
+hand, such as fingers, count in M as locked, and have commands of their own. The actuator of joint j exerts
+gear_j (g_j u_j + b_j0 + b_j1 l_j + b_j2 l̇_j) at length l_j = gear_j q_j, so that the command is
 
     u_j = (torque_j / gear_j - b_j0 - b_j1 l_j - b_j2 l̇_j) / g_j.
 
@@ -29,7 +30,6 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jax.scipy.spatial.transform import Rotation
 
 from milx.core.linear_algebra import solve_free
 from milx.core.mjx import mjx
@@ -46,7 +46,7 @@ class OperationalSpace:
         site: the hand's name.
         axes: which components of the hand's velocity are controlled: 0 to 2 are linear (m/s), 3 to 5 angular (rad/s),
             in the world's axes.
-        time_constant: τ (s). Where a command holds for a while, at least as long as that.
+        time_constant: τ (s), at least as long as a command is held.
         regularization: ρ (1/kg, or 1/(kg m²) for angular components).
 
     Attributes:
@@ -54,7 +54,8 @@ class OperationalSpace:
 
     Raises:
         ValueError: if there is no such site; if one of its joints is not a hinge or slide with exactly one actuator,
-            whose force is affine in its command, length and velocity.
+            whose force is affine in its command, length and velocity; if the components are not some of 0 to 5, each
+            once, or a number is out of its range.
     """
 
     def __init__(
@@ -65,6 +66,12 @@ class OperationalSpace:
         time_constant: float = 0.1,
         regularization: float = 0.0,
     ):
+        if not axes or len(set(axes)) < len(axes) or not set(axes) <= set(range(6)):
+            raise ValueError(f"axes: got {list(axes)}, expected some of 0 to 5, each once")
+        if time_constant <= 0:
+            raise ValueError(f"time_constant: got {time_constant}, expected more than 0 s")
+        if regularization < 0:
+            raise ValueError(f"regularization: got {regularization}, expected at least 0")
         self._site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, site)
         if self._site < 0:
             names = ", ".join(model.site(i).name for i in range(model.nsite))
@@ -76,10 +83,13 @@ class OperationalSpace:
         self._axes, self._time, self._regularization = np.array(axes), time_constant, regularization
         self._gear = model.actuator_gear[self.actuators, 0]
         self._gain = model.actuator_gainprm[self.actuators, 0]
-        self._bias = model.actuator_biasprm[self.actuators, :3]
+        affine = model.actuator_biastype[self.actuators] == mujoco.mjtBias.mjBIAS_AFFINE.value
+        self._bias = affine[:, None] * model.actuator_biasprm[self.actuators, :3]
 
     def command(self, model: mjx.Model, data: mjx.Data, velocity: jax.Array) -> jax.Array:
         """Computes commands [n] of `actuators`, not clipped, that bring the hand to a velocity.
+
+        At a singular pose, for example of a stretched arm, they are NaN or very large without regularization.
 
         Args:
             model: the robot.
@@ -103,25 +113,11 @@ class OperationalSpace:
         own = self._bias[:, 0] + self._bias[:, 1] * length + self._bias[:, 2] * speed
         return (torque / self._gear - own) / self._gain
 
-    def toward(
-        self, model: mjx.Model, data: mjx.Data, position: jax.Array, rotation: jax.Array, time_constant: float
-    ) -> jax.Array:
-        """Computes the hand's velocity [6] that would decrease its distance from a pose by exp(-t / time_constant).
-
-        Args:
-            model: the robot.
-            data: of which `qpos` is read.
-            position: [3] (m).
-            rotation: [3, 3], the wanted axes of the site as columns.
-            time_constant: s.
-        """
-        data = mjx.kinematics(model, data)
-        turn = Rotation.from_matrix(rotation @ data.site_xmat[self._site].T).as_rotvec()
-        return jnp.concatenate([position - data.site_xpos[self._site], turn]) / time_constant
-
     def _moving(self, model: mjx.Model, data: mjx.Data) -> mjx.Data:
         """Computes poses, velocities, inertias and bias forces."""
-        for compute in (mjx.kinematics, mjx.com_pos, mjx.tendon, mjx.crb, mjx.com_vel, mjx.passive, mjx.rne):
+        for compute in (mjx.kinematics, mjx.com_pos, mjx.tendon, mjx.crb, mjx.tendon_armature):
+            data = compute(model, data)
+        for compute in (mjx.com_vel, mjx.passive, mjx.rne, mjx.tendon_bias):
             data = compute(model, data)
         return data
 
@@ -137,7 +133,8 @@ def with_controls(
     """States a problem in other controls.
 
     Args:
-        problem: in the model's own actions, to whose limits what the law computes is clipped.
+        problem: in the model's own actions, to whose limits what the law computes is clipped. Every function of it
+            calls the law anew.
         law: maps the state x [n] and controls [k] to actions [m], as `OperationalSpace.command` may.
         low: the lowest controls [k].
         high: the highest controls [k].
@@ -149,12 +146,14 @@ def with_controls(
     def acting(x: jax.Array, controls: jax.Array) -> jax.Array:
         return jnp.clip(law(x, controls), problem.control_low, problem.control_high)
 
+    approximation = problem.approximation
     return Problem(
         dynamics=lambda x, u: problem.dynamics(x, acting(x, u)),
         running_residual=lambda x, u, t: problem.running_residual(x, acting(x, u), t),
         terminal_residual=problem.terminal_residual,
         control_low=low,
         control_high=high,
+        approximation=approximation and (lambda x, u: approximation(x, acting(x, u))),
     )
 
 
@@ -193,4 +192,8 @@ def _actuator_of(model: mujoco.MjModel, joint: int) -> int:
     affine = gain == mujoco.mjtGain.mjGAIN_FIXED and bias in (mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtBias.mjBIAS_AFFINE)
     if not affine or model.actuator_dyntype[actuator] != mujoco.mjtDyn.mjDYN_NONE.value:
         raise ValueError(f"joint {name!r}: expected an actuator with a fixed gain, an affine bias and no activation")
+    if not model.actuator_gear[actuator, 0] or not model.actuator_gainprm[actuator, 0]:
+        raise ValueError(f"joint {name!r}: got an actuator whose gear or gain is 0, expected another number")
+    if model.jnt_actgravcomp[joint]:
+        raise ValueError(f"joint {name!r}: actgravcomp is not known here, expected false")
     return actuator

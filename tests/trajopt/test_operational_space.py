@@ -38,7 +38,7 @@ ARM = """
     <site name="fixed"/>
   </worldbody>
   <actuator>
-    <motor joint="pan" gear="3"/>
+    <general joint="pan" gear="3" biasprm="5 1 1"/>
     <motor joint="lift" gear="20"/>
     <position joint="elbow" kp="30" kv="2"/>
     <velocity joint="roll" kv="5" gear="2"/>
@@ -77,10 +77,10 @@ def accelerations(model):
     plant = mjx.put_model(model)
 
     def under(
-        law: OperationalSpace, moving: list[mujoco.MjData], wanted: np.ndarray
+        law: OperationalSpace, states: list[mujoco.MjData], wanted: np.ndarray
     ) -> list[tuple[np.ndarray, np.ndarray]]:
         command, found = jax.jit(law.command), []
-        for data in moving:
+        for data in states:
             data.ctrl[law.actuators] = command(plant, mjx.put_data(model, data), jnp.asarray(wanted))
             mujoco.mj_forward(model, data)
             jacobian = np.zeros((6, model.nv))
@@ -91,7 +91,7 @@ def accelerations(model):
     return under
 
 
-def test_the_hand_gets_the_acceleration_that_the_law_asks_for(model, accelerations):
+def test_the_joints_accelerate_the_hand_as_the_law_asks(model, accelerations):
     law, wanted = OperationalSpace(model, "tip", time_constant=TAU), np.linspace(-0.5, 0.7, 6)
     states = [moving(model, seed) for seed in range(3)]
     for data, (jacobian, found) in zip(states, accelerations(law, states, wanted), strict=True):
@@ -111,20 +111,22 @@ def test_components_that_are_not_controlled_slow_down_with_the_joints_and_regula
     np.testing.assert_allclose(found[:7], of_hand + of_rest, atol=1e-6)
 
 
-def test_going_toward_a_pose_shortens_the_way_exponentially(model):
-    data, law = moving(model, 0), OperationalSpace(model, "tip")
-    there = moving(model, 1)
-    site = model.site("tip").id
-    goal = jnp.asarray(there.site_xpos[site]), jnp.asarray(there.site_xmat[site].reshape(3, 3))
-    velocity = np.asarray(jax.jit(law.toward)(mjx.put_model(model), mjx.put_data(model, data), *goal, 0.5))
-    np.testing.assert_allclose(velocity[:3], (there.site_xpos[site] - data.site_xpos[site]) / 0.5, atol=1e-9)
-    turn, own, quat, after = np.zeros(4), np.zeros(4), np.zeros(4), np.zeros(9)
-    mujoco.mju_mat2Quat(own, data.site_xmat[site])
-    speed = np.linalg.norm(velocity[3:])
-    mujoco.mju_axisAngle2Quat(turn, velocity[3:] / speed, 0.5 * speed)
-    mujoco.mju_mulQuat(quat, turn, own)
-    mujoco.mju_quat2Mat(after, quat)
-    np.testing.assert_allclose(after, there.site_xmat[site], atol=1e-9)
+@pytest.mark.slow
+def test_many_commands_at_once_in_float32_are_those_of_one_in_float64(model):
+    law, states = (
+        OperationalSpace(model, "tip", (0, 1, 2), TAU, regularization=0.01),
+        [moving(model, i) for i in range(4)],
+    )
+    wanted = np.array([0.4, -0.2, 0.1])
+
+    def commands(dtype):
+        cast = lambda tree: jax.tree.map(lambda x: x.astype(dtype) if x.dtype == jnp.float64 else x, tree)  # noqa: E731
+        plant = cast(mjx.put_model(model))
+        batch = cast(jax.tree.map(lambda *x: jnp.stack(x), *(mjx.put_data(model, state) for state in states)))
+        return jax.jit(jax.vmap(law.command, (None, 0, None)))(plant, batch, jnp.asarray(wanted, dtype))
+
+    exact = commands(jnp.float64)
+    np.testing.assert_allclose(commands(jnp.float32), exact, atol=1e-4 * np.abs(exact).max())
 
 
 def test_a_problem_in_other_controls_costs_what_its_actions_cost():
@@ -135,11 +137,13 @@ def test_a_problem_in_other_controls_costs_what_its_actions_cost():
         terminal_residual=lambda x: 3.0 * x,
         control_low=jnp.full(2, -1.0),
         control_high=jnp.full(2, 1.0),
+        approximation=lambda x, u: x + 0.9 * u,
     )
     changed = with_controls(problem, lambda x, v: gain @ v - 0.1 * x, jnp.array([-2.0]), jnp.array([2.0]))
     x, v, t = jnp.array([0.5, -0.3]), jnp.array([0.8]), jnp.asarray(2)
     u = jnp.array([1.0, -0.77])  # 1.55 is clipped
     np.testing.assert_allclose(changed.dynamics(x, v), x + u, atol=1e-12)
+    np.testing.assert_allclose(changed.approximation(x, v), x + 0.9 * u, atol=1e-12)
     np.testing.assert_allclose(changed.running_residual(x, v, t), jnp.concatenate([x, 2 * u]), atol=1e-12)
     np.testing.assert_allclose(changed.terminal_residual(x), 3 * x, atol=1e-12)
 
@@ -166,3 +170,18 @@ def test_a_problem_in_other_controls_costs_what_its_actions_cost():
 def test_what_the_law_cannot_drive_is_named(change, site, message):
     with pytest.raises(ValueError, match=message):
         OperationalSpace(mujoco.MjModel.from_xml_string(ARM.replace(*change) if change[0] else ARM), site)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"axes": (0, 6)}, r"axes: got \[0, 6\], expected some of 0 to 5, each once"),
+        ({"axes": (1, 1)}, r"axes: got \[1, 1\]"),
+        ({"axes": ()}, r"axes: got \[\]"),
+        ({"time_constant": 0.0}, "time_constant: got 0.0, expected more than 0 s"),
+        ({"regularization": -1.0}, "regularization: got -1.0, expected at least 0"),
+    ],
+)
+def test_numbers_out_of_range_are_named(model, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        OperationalSpace(model, "tip", **arguments)
