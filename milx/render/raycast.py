@@ -29,7 +29,6 @@ from milx.render.meshes import Meshes, Vector
 TINY = 1e-12
 # A shadow falls on a mesh from itself if it is at least this fraction of its diagonal away.
 _OWN = 1e-3
-_DIAGONAL = np.concatenate([-np.eye(3), np.eye(3)])  # of a box [6]
 
 
 class Kind(enum.IntEnum):
@@ -292,7 +291,8 @@ def blocked(
             mesh = None
             if kind == Kind.MESH and triangles is not None:  # rays that start on a mesh must not meet it there
                 root = jnp.asarray(triangles.root)[geom_id]
-                size = jnp.linalg.norm(jnp.asarray(triangles.box, ray[0].dtype)[root] @ _DIAGONAL)
+                box = jnp.asarray(triangles.box, start[0].dtype)[root]
+                size = jnp.linalg.norm(box[3:] - box[:3])
                 mesh = triangles, root, _OWN * size / jnp.sqrt(dot(ray, ray))
             t = enter(kind, rows_of(to_unit.affine), to_unit.stretch, start, ray, mesh)
             return found | (shown & (t > 0) & (t < reach)), None
