@@ -24,6 +24,7 @@ Reference:
         IEEE Journal of Robotics and Automation 3(1), 1987.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 
 import jax
@@ -36,6 +37,7 @@ from milx.core.mjx import mjx
 from milx.trajopt.ilqr import Problem
 
 _KINDS = mujoco.mjtJoint
+_product = functools.partial(jnp.matmul, precision=jax.lax.Precision.HIGHEST)  # a GPU rounds more by default
 
 
 class OperationalSpace:
@@ -99,16 +101,16 @@ class OperationalSpace:
         data = self._moving(model, data)
         jacobian = self._jacobian(model, data)[self._axes]
         joint_velocity = data.qvel[self._dofs]
-        acceleration = (velocity - jacobian @ joint_velocity) / self._time
+        acceleration = (velocity - _product(jacobian, joint_velocity)) / self._time
         inertia = mjx.full_m(model, data)[np.ix_(self._dofs, self._dofs)]
         n, k = len(self._dofs), len(self._axes)
         through = solve_free(inertia, jacobian.T, jnp.ones(n, bool))  # M⁻¹ Jᵀ
-        mobility = jacobian @ through + self._regularization * jnp.eye(k, dtype=inertia.dtype)
+        mobility = _product(jacobian, through) + self._regularization * jnp.eye(k, dtype=inertia.dtype)
         # Jᵀ Λ a + N M q̈_0 = M q̈_0 + Jᵀ Λ (a - J q̈_0)
         at_rest = -joint_velocity / self._time
-        force = solve_free(mobility, acceleration - jacobian @ at_rest, jnp.ones(k, bool))
+        force = solve_free(mobility, acceleration - _product(jacobian, at_rest), jnp.ones(k, bool))
         bias = (data.qfrc_bias - data.qfrc_passive)[self._dofs]
-        torque = inertia @ at_rest + jacobian.T @ force + bias
+        torque = _product(inertia, at_rest) + _product(jacobian.T, force) + bias
         length, speed = self._gear * data.qpos[self._qpos], self._gear * joint_velocity
         own = self._bias[:, 0] + self._bias[:, 1] * length + self._bias[:, 2] * speed
         return (torque / self._gear - own) / self._gain
