@@ -25,6 +25,7 @@ from milx.envs.push.env import Push, PushTask
 from milx.evaluation import provenance
 from milx.evaluation.intervals import wilson_interval
 from milx.trajopt import sampling
+from milx.trajopt.expert import problem_of
 from milx.trajopt.ilqr import Problem
 from milx.trajopt.operational_space import OperationalSpace, with_controls
 from milx.trajopt.sampling import Options, Search
@@ -37,7 +38,9 @@ DEVIATION = (0.3, 0.3, 0.3, 1.0)
 UPRIGHT = 6.0
 """Rate at which the hand returns to pointing down (1/s)."""
 TIME_CONSTANT, REGULARIZATION = 0.06, 1e-2
+"""Of the law: its time constant (s), a little more than a time step, and what bounds torques near singular poses."""
 NOISE = 0.1
+"""Standard deviation on the actions; the presets'."""
 EVERY = (10, 20)
 """Time steps from one plan to the next, under noise."""
 REPLANNED = 0.3
@@ -70,14 +73,7 @@ class Planner:
 
     def problem(self, task: PushTask, start: State) -> Problem:
         """States the problem of a scene, with the environment's costs, in velocities of the hand."""
-        env = self.env
-        problem = Problem(
-            dynamics=lambda x, u: env.step(task, start.with_vector(x), u).vector,
-            running_residual=lambda x, u, t: env.running_residual(task, start.with_vector(x), u, t),
-            terminal_residual=lambda x: env.terminal_residual(task, start.with_vector(x)),
-            control_low=env.action_range[0],
-            control_high=env.action_range[1],
-        )
+        problem = problem_of(self.env, task, start)
         limits = jnp.array(LIMITS)
         return with_controls(problem, lambda x, v: self.action(start.with_vector(x), v), -limits, limits)
 

@@ -23,10 +23,10 @@ VERSION = 1
 taken for one planned after it."""
 
 
-def plan(env: Env, task: Task, state: State, options: Options) -> Plan:
-    """Plans one episode from `state`: iLQR on the environment's costs, started from the environment's guess."""
+def problem_of(env: Env, task: Task, state: State) -> Problem:
+    """States the problem of an episode from `state`: the environment's dynamics, costs and limits."""
     low, high = env.action_range
-    problem = Problem(
+    return Problem(
         dynamics=lambda x, u: env.step(task, state.with_vector(x), u).vector,
         running_residual=lambda x, u, t: env.running_residual(task, state.with_vector(x), u, t),
         terminal_residual=lambda x: env.terminal_residual(task, state.with_vector(x)),
@@ -34,7 +34,11 @@ def plan(env: Env, task: Task, state: State, options: Options) -> Plan:
         control_high=high,
         approximation=lambda x, u: env.approximate_step(task, state.with_vector(x), u).vector,
     )
-    return solve(problem, state.vector, env.guess(task, state), options)
+
+
+def plan(env: Env, task: Task, state: State, options: Options) -> Plan:
+    """Plans one episode from `state`: iLQR on the environment's costs, started from the environment's guess."""
+    return solve(problem_of(env, task, state), state.vector, env.guess(task, state), options)
 
 
 Feedback = Callable[[State, jax.Array], jax.Array]
