@@ -21,11 +21,12 @@ from tables import chosen, interval
 
 import milx
 
+RESULTS = pathlib.Path(__file__).parents[1] / "results" / "paper_results"
+"""The folder of the table `results`."""
+
 for _name in ("seeds", "show", "out", "rows"):  # the others of options.py do nothing here
     flags.declare_key_flag(_name)
 _TABLE = flags.DEFINE_enum("table", "results", list(TABLES), "Which table.")
-RESULTS = pathlib.Path(__file__).parents[1] / "results" / "paper_results"
-"""The folder of the table `results`."""
 _SEED = flags.DEFINE_integer("first_seed", 0, "The first of the seeds.")
 _CURVES = flags.DEFINE_string("curves", None, "Where to draw the learning curves; default nowhere.")
 
