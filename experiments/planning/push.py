@@ -1,11 +1,12 @@
 """How reliably push can be demonstrated by sampling, without a controller: success by the number of rollouts.
 
     python experiments/planning/push.py                    # on a GPU; what has its file is not run again
-    python experiments/planning/push.py --rows=cem-64 --scenes=4 --iterations=2
+    python experiments/planning/push.py --rows=cem-32 --scenes=4 --iterations=2 --more=2
 
 The planner samples velocities of the hand, which an operational-space law turns into torques. It plans whole episodes
-for an arm without noise; then it executes them under the presets' noise on the actions, and plans again every few time
-steps.
+for an arm without noise: in the first scenes from nothing, in other scenes from the cheapest of the plans that
+succeeded in some of the first. Then it executes these under the presets' noise on the actions, in three ways: as they
+are, tracking the path of the hand without noise, or planning again every few time steps.
 """
 
 import functools
@@ -35,24 +36,25 @@ LIMITS = (0.8, 0.8, 0.6, 3.0)
 """Of the hand's velocity along x, y and z (m/s), and of its turning about z (rad/s)."""
 DEVIATION = (0.3, 0.3, 0.3, 1.0)
 """Standard deviation of the first candidates, in the same units."""
+PLANS, NEAR = 64, 0.3
+"""Plans of other scenes that a scene tries, and the deviation of the first candidates then, as a fraction."""
 UPRIGHT = 6.0
 """Rate at which the hand returns to pointing down (1/s)."""
 TIME_CONSTANT, REGULARIZATION = 0.06, 1e-2
 """Of the law: its time constant (s), a little more than a time step, and what bounds torques near singular poses."""
 NOISE = 0.1
 """Standard deviation on the actions; the presets'."""
-EVERY = (10, 20)
-"""Time steps from one plan to the next, under noise."""
-REPLANNED = 0.3
-"""Standard deviation of candidates when planning again, as a fraction of the first ones'."""
+TRACKING = 6.0
+"""Rate at which the hand returns to its path when it tracks it (1/s)."""
+EVERY = 20
+"""Time steps from one plan to the next, where it plans again."""
 _CEM = functools.partial(Options, "cross_entropy", deviation_min=0.03)
 ROWS = {
-    "cem-64": _CEM(samples=64, elites=8),
-    "cem-256": _CEM(samples=256, elites=16),
-    "mppi-64": Options("mppi", samples=64, temperature=0.05),
-    "predictive-64": Options("predictive", samples=64),
-    "cem-64-held": _CEM(samples=64, elites=8, order=0),
-    "cem-64-cubic": _CEM(samples=64, elites=8, order=3),
+    "cem-32": _CEM(samples=32, elites=6, order=3),
+    "cem-64": _CEM(samples=64, elites=8, order=3),
+    "cem-32-linear": _CEM(samples=32, elites=6),
+    "mppi-32": Options("mppi", samples=32, temperature=0.05, order=3),
+    "predictive-32": Options("predictive", samples=32, order=3),
 }
 """Planners by name."""
 
@@ -78,68 +80,184 @@ class Planner:
         return with_controls(problem, lambda x, v: self.action(start.with_vector(x), v), -limits, limits)
 
     @functools.partial(jax.jit, static_argnums=0)
-    def improve(self, task: PushTask, start: State, search: Search, key: jax.Array) -> tuple[Search, jax.Array]:
-        """Does one iteration in every scene, and tells which of the plans succeed without noise."""
+    def start_from(self, task: PushTask, start: State, plans: jax.Array) -> Search:
+        """Begins a search in every scene, from the cheapest of its own plans [scenes, PLANS, KNOTS, 4]."""
 
-        def one(task: PushTask, start: State, search: Search, key: jax.Array) -> tuple[Search, jax.Array]:
+        def one(task: PushTask, start: State, plans: jax.Array) -> Search:
+            problem, deviation = self.problem(task, start), NEAR * jnp.array(DEVIATION)
+            return sampling.start_from(problem, start.vector, plans, deviation, self.env.horizon, self.options)
+
+        return jax.vmap(one)(task, start, plans)
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def improve(self, task: PushTask, start: State, search: Search, key: jax.Array) -> Search:
+        """Does one iteration in every scene."""
+
+        def one(task: PushTask, start: State, search: Search, key: jax.Array) -> Search:
             problem = self.problem(task, start)
-            search = sampling.solve(problem, start.vector, search, self.env.horizon, key, self.options)
-            controls = sampling.actions_of(problem, search.knots, self.env.horizon, self.options)
-            after = lambda x, u: (problem.dynamics(x, u),) * 2  # noqa: E731
-            return search, self._success(task, start, jax.lax.scan(after, start.vector, controls)[1])
+            return sampling.solve(problem, start.vector, search, self.env.horizon, key, self.options)
 
         return jax.vmap(one)(task, start, search, key)
 
-    @functools.partial(jax.jit, static_argnums=(0, 5))
-    def execute(self, task: PushTask, start: State, search: Search, key: jax.Array, every: int) -> jax.Array:
-        """Tells in which scenes plans succeed under noise, if one iteration plans again every so many time steps."""
+    @functools.partial(jax.jit, static_argnums=0)
+    def execute(
+        self,
+        task: PushTask,
+        start: State,
+        search: Search,
+        key: jax.Array,
+        noise: jax.Array,
+        rate: jax.Array,
+        path: jax.Array,
+    ) -> tuple[jax.Array, jax.Array]:
+        """Executes the plans.
+
+        Args:
+            task: of every scene.
+            start: where it begins.
+            search: its plan.
+            key: one for each scene, for the noise.
+            noise: standard deviation on the actions.
+            rate: at which the hand returns to its path (1/s).
+            path: [scenes, T, 4], x, y, z (m) and turn (rad) of the hand.
+
+        Returns:
+            In which scenes that succeeded, and the paths [scenes, T, 4] of the hand.
+        """
+
+        def one(task: PushTask, start: State, search: Search, key: jax.Array, path: jax.Array):
+            controls = sampling.actions_of(self.problem(task, start), search.knots, self.env.horizon, self.options)
+
+            def step(x: jax.Array, inputs: tuple[jax.Array, jax.Array, jax.Array]):
+                velocity, wanted, key = inputs
+                hand = self.hand(start.with_vector(x))
+                away = wanted - hand
+                away = away.at[3].set(jnp.arctan2(jnp.sin(away[3]), jnp.cos(away[3])))
+                after = self._act(task, start.with_vector(x), velocity + rate * away, noise, key)
+                return after, (after, hand)
+
+            inputs = controls, path, jax.random.split(key, self.env.horizon)
+            _, (vectors, hands) = jax.lax.scan(step, start.vector, inputs)
+            return self._success(task, start, vectors), hands
+
+        return jax.vmap(one)(task, start, search, key, path)
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def replan(self, task: PushTask, start: State, search: Search, key: jax.Array) -> jax.Array:
+        """Tells in which scenes plans succeed under noise, if one iteration plans again every few time steps."""
 
         def one(task: PushTask, start: State, search: Search, key: jax.Array) -> jax.Array:
             def plant(x: jax.Array, velocity: jax.Array, key: jax.Array) -> jax.Array:
-                action = jnp.clip(self.action(start.with_vector(x), velocity), *self.env.action_range)
-                return self.env.step(task, start.with_vector(x), action + NOISE * jax.random.normal(key, (7,))).vector
+                return self._act(task, start.with_vector(x), velocity, NOISE, key)
 
             horizon, problem = self.env.horizon, self.problem(task, start)
             states, _ = sampling.control(
-                problem, start.vector, search, horizon, horizon, every, key, self.options, plant
+                problem, start.vector, search, horizon, horizon, EVERY, key, self.options, plant
             )
             return self._success(task, start, states[1:])
 
         return jax.vmap(one)(task, start, search, key)
+
+    def hand(self, state: State) -> jax.Array:
+        """Returns x, y, z (m) of the hand, and its turn about z (rad)."""
+        hand = self.env.hand(state.qpos)
+        return jnp.append(hand[:3], jnp.arctan2(hand[4], hand[3]))
+
+    def _act(
+        self, task: PushTask, state: State, velocity: jax.Array, noise: jax.Array | float, key: jax.Array
+    ) -> jax.Array:
+        action = jnp.clip(self.action(state, velocity), *self.env.action_range)
+        return self.env.step(task, state, action + noise * jax.random.normal(key, action.shape)).vector
 
     def _success(self, task: PushTask, start: State, vectors: jax.Array) -> jax.Array:
         states = jax.vmap(start.with_vector)(jnp.concatenate([start.vector[None], vectors]))
         return self.env.success(task, states)
 
 
-def measure(options: Options, scenes: int, iterations: int) -> dict[str, Any]:
-    """Measures a planner: success after every iteration, and under noise after the last."""
-    env = envs.make("push", (16, 16))
-    planner, began = Planner(env, options), time.perf_counter()
-    task_key, scene_key, key = jax.random.split(jax.random.key(0), 3)
-    task = jax.vmap(env.sample_task, in_axes=(0, None))(jax.random.split(task_key, scenes), "train")
-    start = jax.vmap(env.reset)(jax.random.split(scene_key, scenes), task)
+class Measurement:
+    """Measures a planner in some scenes, which `seed` draws."""
+
+    def __init__(self, planner: Planner, scenes: int, seed: int):
+        self.planner, self.scenes = planner, scenes
+        task_key, scene_key, self._key = jax.random.split(jax.random.key(seed), 3)
+        env = planner.env
+        self.task = jax.vmap(env.sample_task, in_axes=(0, None))(jax.random.split(task_key, scenes), "train")
+        self.start = jax.vmap(env.reset)(jax.random.split(scene_key, scenes), self.task)
+
+    def keys(self, number: int) -> jax.Array:
+        """Returns a key for each scene."""
+        return jax.random.split(jax.random.fold_in(self._key, number), self.scenes)
+
+    def execute(self, search: Search, noise: float, rate: float, path: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Executes the plans; see `Planner.execute`."""
+        return self.planner.execute(self.task, self.start, search, self.keys(1000), noise, rate, path)
+
+    def path(self, search: Search) -> tuple[jax.Array, jax.Array]:
+        """Tells which plans succeed without noise, and how the hand moves then."""
+        return self.execute(search, 0.0, 0.0, jnp.zeros((self.scenes, self.planner.env.horizon, 4)))
+
+    def plan(self, search: Search, iterations: int, rollouts: int) -> tuple[Search, list[dict[str, Any]]]:
+        """Improves plans that have cost so many rollouts, and tells what comes of it; the first seconds compile."""
+        curve = [self._point(search, rollouts, 0.0)]
+        for number in range(iterations):
+            began = time.perf_counter()
+            search = jax.block_until_ready(self.planner.improve(self.task, self.start, search, self.keys(number)))
+            rollouts += self.planner.options.samples
+            curve.append(self._point(search, rollouts, time.perf_counter() - began))
+        return search, curve
+
+    def _point(self, search: Search, rollouts: int, seconds: float) -> dict[str, Any]:
+        found = {"rollouts": rollouts, "success": float(self.path(search)[0].mean()), "seconds": seconds}
+        found["cost"] = float(jnp.median(search.cost))
+        print(found, flush=True)
+        return found
+
+    def under_noise(self, search: Search) -> dict[str, Any]:
+        """Executes plans under noise in three ways."""
+        path = self.path(search)[1]
+        ways = {
+            "open loop": lambda: self.execute(search, NOISE, 0.0, path)[0],
+            "tracking": lambda: self.execute(search, NOISE, TRACKING, path)[0],
+            f"planning again every {EVERY} steps": lambda: self.planner.replan(
+                self.task, self.start, search, self.keys(2000)
+            ),
+        }
+        found = {}
+        for way, execute in ways.items():
+            count = int(execute().sum())
+            found[way] = {"success": count / self.scenes, "wilson95": wilson_interval(count, self.scenes)}
+            print(way, found[way], flush=True)
+        return found
+
+
+def measure(options: Options, scenes: int, iterations: int, more: int) -> dict[str, Any]:
+    """Measures a planner: from nothing in the first scenes, from their plans in as many others, and under noise there.
+
+    Raises:
+        RuntimeError: if no plan succeeds in the first scenes.
+    """
+    planner = Planner(envs.make("push", (16, 16)), options)
+    first = Measurement(planner, scenes, 0)
     search = jax.vmap(lambda _: sampling.start(jnp.zeros((KNOTS, 4)), jnp.array(DEVIATION)))(jnp.arange(scenes))
-    curve = []
-    for number in range(iterations):
-        search, success = planner.improve(
-            task, start, search, jax.random.split(jax.random.fold_in(key, number), scenes)
-        )
-        curve.append({"rollouts": (number + 1) * options.samples, "success": float(success.mean())})
-        curve[-1] |= {"cost": float(jnp.median(search.cost)), "seconds": time.perf_counter() - began}
-        print(curve[-1], flush=True)
-    search = search._replace(deviation=jnp.broadcast_to(REPLANNED * jnp.array(DEVIATION), search.deviation.shape))
-    noisy = []
-    for every in EVERY:
-        began = time.perf_counter()
-        success = planner.execute(
-            task, start, search, jax.random.split(jax.random.fold_in(key, 1000 + every), scenes), every
-        )
-        count = int(success.sum())
-        noisy.append({"every": every, "success": count / scenes, "wilson95": wilson_interval(count, scenes)})
-        noisy[-1]["seconds"] = time.perf_counter() - began
-        print(noisy[-1], flush=True)
-    return {"scenes": scenes, "without_noise": curve, "noise": NOISE, "under_noise": noisy}
+    search, from_nothing = first.plan(search, iterations, 0)
+    good = search.knots[first.path(search)[0]]
+    if not len(good):
+        raise RuntimeError(f"no plan of {scenes} scenes succeeded after {iterations} iterations")
+    second = Measurement(planner, scenes, 1)
+    plans = jax.random.choice(jax.random.key(2), good, (scenes, PLANS))
+    began = time.perf_counter()
+    search = jax.block_until_ready(planner.start_from(second.task, second.start, plans))
+    seconds = time.perf_counter() - began
+    search, from_plans = second.plan(search, more, PLANS)
+    from_plans[0]["seconds"] = seconds
+    return {
+        "scenes": scenes,
+        "from_nothing": from_nothing,
+        "plans_that_succeeded": len(good),
+        "from_plans": from_plans,
+        "noise": NOISE,
+        "under_noise": second.under_noise(search),
+    }
 
 
 def main(_: list[str]) -> None:
@@ -151,13 +269,14 @@ def main(_: list[str]) -> None:
         path = folder / f"{name}.json"
         if not path.exists():
             print(name, flush=True)
-            found = measure(ROWS[name], _SCENES.value, _ITERATIONS.value)
+            found = measure(ROWS[name], _SCENES.value, _ITERATIONS.value, _MORE.value)
             files.write_json(path, {"planner": name, "options": vars(ROWS[name]), **found, **provenance.origin()})
 
 
 if __name__ == "__main__":
     _ROWS = flags.DEFINE_multi_enum("rows", list(ROWS), list(ROWS), "Which planners (repeat the flag).")
     _SCENES = flags.DEFINE_integer("scenes", 256, "Scenes, each of another task.", lower_bound=1)
-    _ITERATIONS = flags.DEFINE_integer("iterations", 16, "Iterations.", lower_bound=1)
+    _ITERATIONS = flags.DEFINE_integer("iterations", 30, "Iterations from nothing.", lower_bound=1)
+    _MORE = flags.DEFINE_integer("more", 12, "Iterations from plans of other scenes.", lower_bound=1)
     _OUT = flags.DEFINE_string("out", "experiments/results/planning", "Folder of the JSON files.")
     app.run(main)

@@ -7,9 +7,10 @@ are a spline of K knots θ in R^{K x m},
 
 where B [T, K] holds each knot for T/K steps (order 0), or interpolates linearly (1) or by a natural cubic spline (3)
 between knots at even intervals from the first step to the last.
-One iteration draws N candidates around a mean θ̄, the first of which is the mean itself,
+One iteration draws N candidates around a mean θ̄, of which the first is the mean itself, and the second the cheapest
+candidate θ* of the iteration before, unless that is the mean,
 
-    θ_i = clip(θ̄ + σ ε_i, low, high)    with  ε_0 = 0  and  ε_i ~ N(0, I),
+    θ_0 = clip(θ̄, low, high)    θ_1 = θ*    θ_i = clip(θ̄ + σ ε_i, low, high)  with  ε_i ~ N(0, I),
 
 rolls all of them out, and moves the mean by their costs J_i:
 
@@ -23,6 +24,7 @@ Candidates with a state that is not finite cost infinitely much; where all do, t
 References:
     Howell et al., "Predictive sampling: real-time behaviour synthesis with MuJoCo", arXiv:2212.00541.
     Rubinstein & Kroese, "The cross-entropy method", Springer 2004.
+    Pinneri et al., "Sample-efficient cross-entropy method for real-time planning", CoRL 2020 (keeps cheap candidates).
     Williams et al., "Information theoretic MPC for model-based reinforcement learning", ICRA 2017.
 """
 
@@ -89,18 +91,45 @@ class Search(NamedTuple):
     Attributes:
         knots: [K, m], θ̄.
         deviation: [K, m], σ, in the units of the actions.
-        cost: the lowest J_i of the last iteration; inf before the first.
+        best: [K, m], θ*; θ̄ before the first iteration.
+        cost: the lowest J_i of the last iteration, that of θ*; inf before the first.
     """
 
     knots: jax.Array
     deviation: jax.Array
+    best: jax.Array
     cost: jax.Array
 
 
 def start(knots: jax.Array, deviation: jax.Array | float) -> Search:
     """Begins a search around knots [K, m]; `deviation` is broadcast to the same shape."""
     knots = jnp.asarray(knots, float)
-    return Search(knots, jnp.broadcast_to(jnp.asarray(deviation, knots.dtype), knots.shape), jnp.asarray(jnp.inf))
+    deviation = jnp.broadcast_to(jnp.asarray(deviation, knots.dtype), knots.shape)
+    return Search(knots, deviation, knots, jnp.full((), jnp.inf, knots.dtype))
+
+
+def start_from(
+    problem: Problem,
+    initial_state: jax.Array,
+    plans: jax.Array,
+    deviation: jax.Array | float,
+    horizon: int,
+    options: Options,
+) -> Search:
+    """Begins a search around the cheapest of several plans, for example those of similar scenes.
+
+    Args:
+        problem: what to solve.
+        initial_state: x_0, [n].
+        plans: their knots, [M, K, m].
+        deviation: of the search, broadcast to [K, m].
+        horizon: T.
+        options: settings, of which `order` counts.
+    """
+    plans = jnp.clip(plans, problem.control_low, problem.control_high)
+    costs = _costs(problem, initial_state, plans, horizon, options)
+    cheapest = jnp.argmin(costs)
+    return start(plans[cheapest], deviation)._replace(cost=costs[cheapest])
 
 
 def basis(order: int, steps: np.ndarray, horizon: int, knots: int) -> np.ndarray:
@@ -132,6 +161,12 @@ def actions_of(problem: Problem, knots: jax.Array, horizon: int, options: Option
     """Returns the actions [T, m] of knots [K, m]."""
     rows = jnp.asarray(basis(options.order, np.arange(horizon), horizon, len(knots)), knots.dtype)
     return jnp.clip(rows @ knots, problem.control_low, problem.control_high)
+
+
+def _costs(problem: Problem, initial_state: jax.Array, knots: jax.Array, horizon: int, options: Options) -> jax.Array:
+    """Returns J [N] of candidates [N, K, m]."""
+    actions = jax.vmap(lambda knots: actions_of(problem, knots, horizon, options))(knots)
+    return jax.vmap(lambda actions: _cost(problem, initial_state, actions))(actions)
 
 
 def _cost(problem: Problem, initial_state: jax.Array, actions: jax.Array) -> jax.Array:
@@ -168,10 +203,12 @@ def solve(
     def iterate(search: Search, key: jax.Array) -> tuple[Search, None]:
         noise = jax.random.normal(key, (options.samples, *search.knots.shape), search.knots.dtype).at[0].set(0.0)
         candidates = search.knots + search.deviation * noise
+        kept = (search.best != search.knots).any()
+        candidates = jnp.where(kept, candidates.at[1:2].set(search.best), candidates)
         candidates = jnp.clip(candidates, problem.control_low, problem.control_high)
-        actions = jax.vmap(lambda knots: actions_of(problem, knots, horizon, options))(candidates)
-        costs = jax.vmap(lambda actions: _cost(problem, initial_state, actions))(actions)
+        costs = _costs(problem, initial_state, candidates, horizon, options)
         moved = UPDATES[options.update](search, candidates, costs, options)
+        moved = moved._replace(best=candidates[jnp.argmin(costs)])
         least = costs.min()
         search = jax.tree.map(lambda new, old: jnp.where(jnp.isfinite(least), new, old), moved, search)
         return search._replace(cost=least), None
@@ -214,8 +251,8 @@ def control(
 ) -> tuple[jax.Array, jax.Array]:
     """Executes the first actions of a plan, plans again from where they lead, and so on (receding horizon).
 
-    The plan before is the next one's mean, moved on by the steps that were executed; σ begins anew. A running residual
-    is given the time since the first step, up to S + T - `every` - 1.
+    The plan before is the next one's mean, moved on by the steps that were executed, and so is θ*; σ begins anew. A
+    running residual is given the time since the first step, up to S + T - `every` - 1.
 
     Args:
         problem: what is planned.
@@ -252,17 +289,17 @@ def control(
         return after, (after, u)
 
     def replan(carry, inputs):
-        x, knots = carry
+        x, plan, best = carry
         now, key = inputs
         plan_key, act_key = jax.random.split(key)
         ahead = problem._replace(running_residual=lambda x, u, t: problem.running_residual(x, u, now + t))
-        found = solve(ahead, x, search._replace(knots=knots), horizon, plan_key, options)
+        found = solve(ahead, x, search._replace(knots=plan, best=best), horizon, plan_key, options)
         actions = actions_of(problem, found.knots, horizon, options)[:every]
         x, executed = lax.scan(act, x, (actions, jax.random.split(act_key, every)))
-        return (x, moved @ found.knots), executed
+        return (x, moved @ found.knots, moved @ found.best), executed
 
     times = jnp.arange(0, steps, every, dtype=jnp.int32)
     inputs = times, jax.random.split(key, len(times))
-    _, (states, actions) = lax.scan(replan, (initial_state, search.knots), inputs)
+    _, (states, actions) = lax.scan(replan, (initial_state, search.knots, search.best), inputs)
     states = jnp.concatenate([initial_state[None], states.reshape(steps, -1)])
     return states, actions.reshape(steps, -1)

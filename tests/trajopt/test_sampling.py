@@ -82,7 +82,7 @@ def test_limits_are_kept_and_their_best_cost_is_reached():
     assert best * (1 - 1e-6) <= cost(lq, actions) < best + 1e-2 * (first - best)
 
 
-def test_more_samples_cost_less_and_no_iteration_of_predictive_sampling_costs_more():
+def test_more_samples_cost_less():
     lq = random_lq(2, T=8, n=3, m=2)
     problem, state, first = lq_problem(lq, np.inf), jnp.asarray(lq["x_0"]), sampling.start(jnp.zeros((8, 2)), 0.3)
     means = []
@@ -91,13 +91,29 @@ def test_more_samples_cost_less_and_no_iteration_of_predictive_sampling_costs_mo
         solve = jax.vmap(lambda key, options=options: sampling.solve(problem, state, first, 8, key, options).cost)
         means.append(jax.jit(solve)(jax.random.split(jax.random.key(0), 8)).mean())
     assert means[0] > means[1] > means[2]
-    step = jax.jit(lambda search, key: sampling.solve(problem, state, search, 8, key, Options(samples=8)))
-    search = first
+
+
+@pytest.mark.parametrize("update", sampling.UPDATES)
+def test_the_cheapest_candidate_is_kept(update):
+    lq = random_lq(2, T=8, n=3, m=2)
+    problem, state, search = lq_problem(lq, np.inf), jnp.asarray(lq["x_0"]), sampling.start(jnp.zeros((8, 2)), 0.3)
+    options = Options(update, samples=8, elites=4)
+    step = jax.jit(lambda search, key: sampling.solve(problem, state, search, 8, key, options))
     for key in jax.random.split(jax.random.key(1), 20):
         after = step(search, key)
-        np.testing.assert_allclose(after.cost, cost(lq, np.asarray(after.knots)), rtol=1e-9)
+        np.testing.assert_allclose(after.cost, cost(lq, np.asarray(after.best)), rtol=1e-9)
         assert after.cost <= search.cost
         search = after
+
+
+def test_a_search_begins_with_the_cheapest_of_several_plans():
+    lq = random_lq(2, T=8, n=3, m=2)
+    problem, state = lq_problem(lq, 0.5), jnp.asarray(lq["x_0"])
+    plans = jax.random.normal(jax.random.key(0), (5, 8, 2))
+    found = sampling.start_from(problem, state, plans, 0.3, 8, Options())
+    costs = [cost(lq, np.clip(plan, -0.5, 0.5)) for plan in plans]
+    np.testing.assert_allclose(found.cost, min(costs), rtol=1e-9)
+    np.testing.assert_allclose(found.knots, np.clip(plans[np.argmin(costs)], -0.5, 0.5))
 
 
 @pytest.mark.parametrize("update", sampling.UPDATES)
