@@ -4,9 +4,9 @@
     python experiments/planning/push.py --rows=cem-32 --scenes=4 --iterations=2 --more=2
 
 The planner samples velocities of the hand, which an operational-space law turns into torques. It plans whole episodes
-for an arm without noise: in the first scenes from nothing, in other scenes from the cheapest of the plans that
-succeeded in some of the first. Then it executes these under the presets' noise on the actions, in three ways: as they
-are, tracking the path of the hand without noise, or planning again every few time steps.
+for an arm without noise: in the first scenes from nothing, in other scenes from the cheapest of a few plans that are
+drawn among those that succeeded in the first. Then it executes these under the presets' noise on the actions, in three
+ways: as they are, tracking the path of the hand without noise, or planning again every EVERY time steps.
 """
 
 import functools
@@ -37,7 +37,8 @@ LIMITS = (0.8, 0.8, 0.6, 3.0)
 DEVIATION = (0.3, 0.3, 0.3, 1.0)
 """Standard deviation of the first candidates, in the same units."""
 PLANS, NEAR = 64, 0.3
-"""Plans of other scenes that a scene tries, and the deviation of the first candidates then, as a fraction."""
+"""Plans that a scene tries, drawn with replacement, and the deviation of the first candidates then and when planning
+again, as a fraction of DEVIATION."""
 UPRIGHT = 6.0
 """Rate at which the hand returns to pointing down (1/s)."""
 TIME_CONSTANT, REGULARIZATION = 0.06, 1e-2
@@ -52,7 +53,6 @@ _CEM = functools.partial(Options, "cross_entropy", deviation_min=0.03)
 ROWS = {
     "cem-32": _CEM(samples=32, elites=6, order=3),
     "cem-64": _CEM(samples=64, elites=8, order=3),
-    "cem-32-linear": _CEM(samples=32, elites=6),
     "mppi-32": Options("mppi", samples=32, temperature=0.05, order=3),
     "predictive-32": Options("predictive", samples=32, order=3),
 }
@@ -113,13 +113,13 @@ class Planner:
         """Executes the plans.
 
         Args:
-            task: of every scene.
-            start: where it begins.
-            search: its plan.
-            key: one for each scene, for the noise.
-            noise: standard deviation on the actions.
-            rate: at which the hand returns to its path (1/s).
-            path: [scenes, T, 4], x, y, z (m) and turn (rad) of the hand.
+            task: [scenes].
+            start: [scenes], where they begin.
+            search: [scenes], their plans.
+            key: [scenes], for the noise.
+            noise: standard deviation on the actions, which lie in [-1, 1].
+            rate: at which the hand returns to its path (1/s); velocities that return it may exceed LIMITS.
+            path: [scenes, T, 4], x, y, z (m) and turn (rad) of the hand at the beginning of every time step.
 
         Returns:
             In which scenes that succeeded, and the paths [scenes, T, 4] of the hand.
@@ -138,13 +138,17 @@ class Planner:
 
             inputs = controls, path, jax.random.split(key, self.env.horizon)
             _, (vectors, hands) = jax.lax.scan(step, start.vector, inputs)
-            return self._success(task, start, vectors), hands
+            return self._success(task, start, jnp.concatenate([start.vector[None], vectors])), hands
 
         return jax.vmap(one)(task, start, search, key, path)
 
     @functools.partial(jax.jit, static_argnums=0)
     def replan(self, task: PushTask, start: State, search: Search, key: jax.Array) -> jax.Array:
-        """Tells in which scenes plans succeed under noise, if one iteration plans again every few time steps."""
+        """Tells in which scenes plans succeed under noise, if one iteration plans again every EVERY time steps.
+
+        It plans a whole horizon from there on, past the end of the episode. Moving the knots on changes a plan a little
+        unless EVERY is a multiple of their interval.
+        """
 
         def one(task: PushTask, start: State, search: Search, key: jax.Array) -> jax.Array:
             def plant(x: jax.Array, velocity: jax.Array, key: jax.Array) -> jax.Array:
@@ -154,7 +158,7 @@ class Planner:
             states, _ = sampling.control(
                 problem, start.vector, search, horizon, horizon, EVERY, key, self.options, plant
             )
-            return self._success(task, start, states[1:])
+            return self._success(task, start, states)
 
         return jax.vmap(one)(task, start, search, key)
 
@@ -170,8 +174,7 @@ class Planner:
         return self.env.step(task, state, action + noise * jax.random.normal(key, action.shape)).vector
 
     def _success(self, task: PushTask, start: State, vectors: jax.Array) -> jax.Array:
-        states = jax.vmap(start.with_vector)(jnp.concatenate([start.vector[None], vectors]))
-        return self.env.success(task, states)
+        return self.env.success(task, jax.vmap(start.with_vector)(vectors))
 
 
 class Measurement:
@@ -197,7 +200,17 @@ class Measurement:
         return self.execute(search, 0.0, 0.0, jnp.zeros((self.scenes, self.planner.env.horizon, 4)))
 
     def plan(self, search: Search, iterations: int, rollouts: int) -> tuple[Search, list[dict[str, Any]]]:
-        """Improves plans that have cost so many rollouts, and tells what comes of it; the first seconds compile."""
+        """Improves plans.
+
+        Args:
+            search: [scenes], the plans.
+            iterations: how often.
+            rollouts: that each has cost before.
+
+        Returns:
+            The plans, and before and after every iteration: rollouts of a scene, success of the means, the median of
+            the cheapest candidates' costs, and seconds, those of the first iteration with compilation.
+        """
         curve = [self._point(search, rollouts, 0.0)]
         for number in range(iterations):
             began = time.perf_counter()
@@ -208,18 +221,19 @@ class Measurement:
 
     def _point(self, search: Search, rollouts: int, seconds: float) -> dict[str, Any]:
         found = {"rollouts": rollouts, "success": float(self.path(search)[0].mean()), "seconds": seconds}
-        found["cost"] = float(jnp.median(search.cost))
+        found["cheapest_cost"] = float(jnp.median(search.cost))
         print(found, flush=True)
         return found
 
     def under_noise(self, search: Search) -> dict[str, Any]:
         """Executes plans under noise in three ways."""
         path = self.path(search)[1]
+        deviation = jnp.broadcast_to(NEAR * jnp.array(DEVIATION), search.deviation.shape)
         ways = {
             "open loop": lambda: self.execute(search, NOISE, 0.0, path)[0],
             "tracking": lambda: self.execute(search, NOISE, TRACKING, path)[0],
             f"planning again every {EVERY} steps": lambda: self.planner.replan(
-                self.task, self.start, search, self.keys(2000)
+                self.task, self.start, search._replace(deviation=deviation), self.keys(2000)
             ),
         }
         found = {}
@@ -255,7 +269,9 @@ def measure(options: Options, scenes: int, iterations: int, more: int) -> dict[s
         "from_nothing": from_nothing,
         "plans_that_succeeded": len(good),
         "from_plans": from_plans,
+        "settings": {"knots": KNOTS, "deviation": DEVIATION, "plans": PLANS, "near": NEAR},
         "noise": NOISE,
+        "tracking": TRACKING,
         "under_noise": second.under_noise(search),
     }
 

@@ -7,10 +7,10 @@ are a spline of K knots θ in R^{K x m},
 
 where B [T, K] holds each knot for T/K steps (order 0), or interpolates linearly (1) or by a natural cubic spline (3)
 between knots at even intervals from the first step to the last.
-One iteration draws N candidates around a mean θ̄, of which the first is the mean itself, and the second the cheapest
-candidate θ* of the iteration before, unless that is the mean,
+One iteration draws N candidates around a mean θ̄. The first is the mean itself; the second, if there is one, is the
+cheapest candidate θ* of the last iteration with a finite cost, unless θ* is the mean; the others are random,
 
-    θ_0 = clip(θ̄, low, high)    θ_1 = θ*    θ_i = clip(θ̄ + σ ε_i, low, high)  with  ε_i ~ N(0, I),
+    θ_0 = clip(θ̄, low, high)    θ_1 = clip(θ*, low, high)    θ_i = clip(θ̄ + σ ε_i, low, high)  with  ε_i ~ N(0, I),
 
 rolls all of them out, and moves the mean by their costs J_i:
 
@@ -19,7 +19,7 @@ rolls all of them out, and moves the mean by their costs J_i:
                            (of those among them whose cost is finite; one alone leaves σ as it is)
     MPPI                   θ̄ ← Σ_i w_i θ_i / Σ_i w_i    with  w_i = exp(-(J_i - min_j J_j) / λ).
 
-Candidates with a state that is not finite cost infinitely much; where all do, the mean stays.
+Candidates with a state that is not finite cost infinitely much; where all do, θ̄, σ and θ* stay.
 
 References:
     Howell et al., "Predictive sampling: real-time behaviour synthesis with MuJoCo", arXiv:2212.00541.
@@ -92,7 +92,8 @@ class Search(NamedTuple):
         knots: [K, m], θ̄.
         deviation: [K, m], σ, in the units of the actions.
         best: [K, m], θ*; θ̄ before the first iteration.
-        cost: the lowest J_i of the last iteration, that of θ*; inf before the first.
+        cost: the lowest J_i of the last iteration, inf if all diverged. Before the first iteration: inf after `start`,
+            the cost of θ̄ after `start_from`.
     """
 
     knots: jax.Array
@@ -121,12 +122,15 @@ def start_from(
     Args:
         problem: what to solve.
         initial_state: x_0, [n].
-        plans: their knots, [M, K, m].
+        plans: their knots, [M, K, m], which are clipped to the problem's limits.
         deviation: of the search, broadcast to [K, m].
         horizon: T.
         options: settings, of which `order` counts.
+
+    Returns:
+        A search whose θ̄ and θ* are the cheapest plan; the first one if all diverge, with a cost of inf.
     """
-    plans = jnp.clip(plans, problem.control_low, problem.control_high)
+    plans = jnp.clip(plans.astype(initial_state.dtype), problem.control_low, problem.control_high)
     costs = _costs(problem, initial_state, plans, horizon, options)
     cheapest = jnp.argmin(costs)
     return start(plans[cheapest], deviation)._replace(cost=costs[cheapest])

@@ -102,6 +102,8 @@ def test_the_cheapest_candidate_is_kept(update):
     for key in jax.random.split(jax.random.key(1), 20):
         after = step(search, key)
         np.testing.assert_allclose(after.cost, cost(lq, np.asarray(after.best)), rtol=1e-9)
+        if update == "predictive":
+            np.testing.assert_array_equal(after.knots, after.best)
         assert after.cost <= search.cost
         search = after
 
@@ -164,6 +166,7 @@ def test_where_all_diverge_the_search_stays(update):
     once = lambda x, u: jnp.where(x[1] == 0, jnp.array([np.nan, 1.0]), problem.dynamics(jnp.nan_to_num(x), u))  # noqa: E731
     lost = sampling.solve(problem._replace(dynamics=once), state, first, 2, key, options)
     np.testing.assert_array_equal(lost.knots, first.knots)
+    np.testing.assert_array_equal(lost.best, first.knots)
     np.testing.assert_array_equal(lost.deviation, first.deviation)
     assert lost.cost == np.inf
 
@@ -239,6 +242,20 @@ def test_a_plan_goes_on_where_the_one_before_stopped(order):
         np.testing.assert_allclose(states[t], x, atol=1e-9)
         x = lq["A"] @ x + lq["B"] @ actions[t]
     np.testing.assert_allclose(states[6], x, atol=1e-9)
+
+
+def test_the_cheapest_candidate_moves_on_with_the_plan():
+    """Both candidates, the mean and the cheapest one, are elites; NumPy averages them and moves them on."""
+    lq = random_lq(0, T=9, n=2, m=1)
+    at, mean, kept = np.array([0.0, 4.0, 8.0]), np.array([0.0, 0.8, -0.4]), np.array([-0.1, 0.3, 0.2])
+    search = sampling.start(mean[:, None], 0.0)._replace(best=jnp.asarray(kept[:, None]))
+    options, key = Options("cross_entropy", samples=2, elites=2), jax.random.key(0)
+    _, actions = sampling.control(lq_problem(lq, np.inf), jnp.asarray(lq["x_0"]), search, 9, 4, 2, key, options)
+    best = min(mean, kept, key=lambda knots: cost(lq, np.interp(np.arange(9), at, knots)[:, None]))
+    first = (mean + kept) / 2
+    second = (np.interp(at + 2, at, first) + np.interp(at + 2, at, best)) / 2
+    expected = np.concatenate([np.interp([0, 1], at, first), np.interp([0, 1], at, second)])
+    np.testing.assert_allclose(actions[:, 0], expected, atol=1e-9)
 
 
 def test_settings_that_make_no_sense_are_refused():
