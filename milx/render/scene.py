@@ -4,6 +4,7 @@ The camera looks along its -z axis, x to the right and y up. `G` denotes all geo
 in MuJoCo's order. The background is black, as in MuJoCo's renderer for a model without a skybox.
 """
 
+import copy
 import dataclasses
 from functools import partial
 
@@ -88,7 +89,6 @@ class Renderer:
             if value < 1:
                 raise ValueError(f"{name}={value!r}: expected at least 1 pixel")
         self.height, self.width = height, width
-        self._camera = _find_camera(model, camera)
         self._model = model
         self._near, self._far = (float(edge * model.stat.extent) for edge in (model.vis.map.znear, model.vis.map.zfar))
         self._groups = _group_geoms(model)
@@ -97,33 +97,49 @@ class Renderer:
         _check_lights(model)
         self._shadows = shadows
         self._materials = _materials(model)
+        self._aim(camera)
 
-        self._tangent = float(np.tan(np.deg2rad(model.cam_fovy[self._camera]) / 2))
+    def _aim(self, camera: str | int) -> None:
+        height, width = self.height, self.width
+        self._camera = _find_camera(self._model, camera)
+        self._tangent = float(np.tan(np.deg2rad(self._model.cam_fovy[self._camera]) / 2))
         x = (2 * (np.arange(width) + 0.5) / width - 1) * self._tangent * width / height
         y = (1 - 2 * (np.arange(height) + 0.5) / height) * self._tangent
         x, y = np.meshgrid(x, y)
         self._rays = (x.ravel(), y.ravel(), np.array(-1.0))
 
-    def scene(self, data: mjx.Data | mujoco.MjData) -> Scene:
+    def with_camera(self, camera: str | int) -> "Renderer":
+        """Returns a renderer of another camera, which shares all that does not depend on the camera.
+
+        Raises:
+            ValueError: there is no such camera, or it cannot be shown.
+        """
+        other = copy.copy(self)
+        other._aim(camera)
+        return other
+
+    def scene(self, data: mjx.Data | mujoco.MjData, model: mjx.Model | None = None) -> Scene:
         """Returns the scene that the data describes: poses from the data; colors, sizes and lights from the model.
 
         Args:
             data: a state after `kinematics`, `com_pos` and `camlight`, or after `forward` or `step`.
+            model: whose `geom_size`, `geom_rgba`, `mat_rgba`, `light_pos`, `light_dir`, `light_ambient`,
+                `light_diffuse` and `light_specular` count; those of the renderer's model by default.
         """
-        model = self._model
+        own, model = self._model, self._model if model is None else model
 
         def array(values, *shape: int) -> jax.Array:
             return jnp.asarray(values, float).reshape(shape)
 
         # MJX keeps no light poses. Lights are fixed to their bodies, so they follow from those.
-        body_xpos = array(data.xpos, -1, 3)[model.light_bodyid]
-        body_xmat = array(data.xmat, -1, 3, 3)[model.light_bodyid]
-        head = model.vis.headlight
+        body_xpos = array(data.xpos, -1, 3)[own.light_bodyid]
+        body_xmat = array(data.xmat, -1, 3, 3)[own.light_bodyid]
+        head = own.vis.headlight
         return Scene(
             geom_xpos=array(data.geom_xpos, -1, 3),
             geom_xmat=array(data.geom_xmat, -1, 3, 3),
             geom_size=array(model.geom_size, -1, 3),
-            geom_rgba=array(_geom_rgba(model), -1, 4),
+            geom_rgba=_geom_rgba(own.geom_matid, array(model.geom_rgba, -1, 4), array(model.mat_rgba, -1, 4)),
             cam_xpos=array(data.cam_xpos[self._camera], 3),
             cam_xmat=array(data.cam_xmat[self._camera], 3, 3),
             light_xpos=body_xpos + _rotate(body_xmat, array(model.light_pos, -1, 3)),
@@ -251,12 +267,13 @@ def _rotate(matrix: jax.Array, vector: jax.Array) -> jax.Array:
     return jnp.einsum("...ij,...j->...i", matrix, vector, precision=jax.lax.Precision.HIGHEST)
 
 
-def _geom_rgba(model: mujoco.MjModel) -> np.ndarray:
+def _geom_rgba(material: np.ndarray, rgba: jax.Array, of_materials: jax.Array) -> jax.Array:
     """Returns [G, 4] colors. As in MuJoCo, a geom that keeps the default color takes its material's."""
-    rgba = np.array(model.geom_rgba)
-    takes = (model.geom_matid >= 0) & np.all(rgba == np.array([0.5, 0.5, 0.5, 1.0]), axis=1)
-    rgba[takes] = model.mat_rgba[model.geom_matid[takes]]
-    return rgba
+    has = material >= 0
+    if not has.any():
+        return rgba
+    takes = has & jnp.all(rgba == jnp.array([0.5, 0.5, 0.5, 1.0]), axis=1)
+    return jnp.where(takes[:, None], of_materials[np.where(has, material, 0)], rgba)
 
 
 def _materials(model: mujoco.MjModel) -> np.ndarray:
