@@ -169,6 +169,10 @@ def test_where_all_diverge_the_search_stays(update):
     np.testing.assert_array_equal(lost.best, first.knots)
     np.testing.assert_array_equal(lost.deviation, first.deviation)
     assert lost.cost == np.inf
+    plans = jax.random.normal(key, (3, 2, 1))
+    begun = sampling.start_from(problem._replace(dynamics=once), state, plans, 1.0, 2, options)
+    np.testing.assert_array_equal(begun.knots, plans[0])
+    assert begun.cost == np.inf
 
 
 def test_one_elite_that_is_left_does_not_end_the_search():
