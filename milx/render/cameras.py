@@ -41,12 +41,12 @@ def render(
     Raises:
         ValueError: no camera is given, or one that does not exist, or the model asks for what cannot be shown.
     """
-    cameras = [camera] if isinstance(camera, str | int) else list(camera)
-    if not cameras:
+    if isinstance(camera, str | int):
+        renderer = Renderer(model, camera, height, width, shadows=shadows)
+        return renderer.render(renderer.scene(data, mjx_model))
+    if not camera:
         raise ValueError("camera: got none, expected at least one")
-    renderer = Renderer(model, cameras[0], height, width, shadows=shadows)
-    frames = []
-    for each in cameras:
-        renderer = renderer.with_camera(each)
-        frames.append(renderer.render(renderer.scene(data, mjx_model)))
-    return frames[0] if isinstance(camera, str | int) else jax.tree.map(lambda *arrays: jnp.stack(arrays), *frames)
+    first = Renderer(model, camera[0], height, width, shadows=shadows)
+    renderers = [first, *map(first.with_camera, camera[1:])]
+    frames = [renderer.render(renderer.scene(data, mjx_model)) for renderer in renderers]
+    return jax.tree.map(lambda *arrays: jnp.stack(arrays), *frames)
