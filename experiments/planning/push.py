@@ -252,7 +252,8 @@ def measure(options: Options, scenes: int, iterations: int, more: int) -> dict[s
     """
     planner = Planner(envs.make("push", (16, 16)), options)
     first = Measurement(planner, scenes, 0)
-    search = jax.vmap(lambda _: sampling.start(jnp.zeros((KNOTS, 4)), jnp.array(DEVIATION)))(jnp.arange(scenes))
+    begin = jax.vmap(sampling.start, in_axes=None, axis_size=scenes)
+    search = begin(jnp.zeros((KNOTS, 4)), jnp.array(DEVIATION))
     search, from_nothing = first.plan(search, iterations, 0)
     good = search.knots[first.path(search)[0]]
     if not len(good):
