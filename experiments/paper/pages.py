@@ -80,6 +80,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "published-push": lambda: _published("push"),
     "published-baselines": lambda: _published("", "baselines"),
     "published-ladder": lambda: _published("", "ladder"),
+    "published-relatives": lambda: _published("", "relatives"),
     "figure3": lambda: figure3.markdown(list(cells.read(RESULTS / "figure3").values())),
     "figure3-push": lambda: figure3.markdown(list(cells.read(RESULTS / "figure3_push").values())),
     "ablations": lambda: ablations.markdown(cells.read(RESULTS / "ablations"), list(ablations.ABLATIONS), seeds=2),
