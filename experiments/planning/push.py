@@ -17,36 +17,18 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from absl import app, flags
+from planner import DEVIATION, KNOTS, NEAR, TRACKING, Planner, draw, make_env
 
 import milx
-from milx import envs
 from milx.core import files
-from milx.envs.base import State
-from milx.envs.push.env import Push, PushTask
 from milx.evaluation import provenance
 from milx.evaluation.intervals import wilson_interval
-from milx.trajopt import sampling
-from milx.trajopt.expert import problem_of
-from milx.trajopt.ilqr import Problem
-from milx.trajopt.operational_space import OperationalSpace, with_controls
 from milx.trajopt.sampling import Options, Search
 
-KNOTS = 10
-LIMITS = (0.8, 0.8, 0.6, 3.0)
-"""Of the hand's velocity along x, y and z (m/s), and of its turning about z (rad/s)."""
-DEVIATION = (0.3, 0.3, 0.3, 1.0)
-"""Standard deviation of the first candidates, in the same units."""
-PLANS, NEAR = 64, 0.3
-"""Plans that a scene tries, drawn with replacement, and the deviation of the first candidates then and when planning
-again, as a fraction of DEVIATION."""
-UPRIGHT = 6.0
-"""Rate at which the hand returns to pointing down (1/s)."""
-TIME_CONSTANT, REGULARIZATION = 0.06, 1e-2
-"""Of the law: its time constant (s), a little more than a time step, and what bounds torques near singular poses."""
+PLANS = 64
+"""Plans that a scene tries, drawn with replacement."""
 NOISE = 0.1
 """Standard deviation on the actions; the presets'."""
-TRACKING = 6.0
-"""Rate at which the hand returns to its path when it tracks it (1/s)."""
 EVERY = 20
 """Time steps from one plan to the next, where it plans again."""
 _CEM = functools.partial(Options, "cross_entropy", deviation_min=0.03)
@@ -59,145 +41,21 @@ ROWS = {
 """Planners by name."""
 
 
-class Planner:
-    """Plans pushes of the hand by one of ROWS, one iteration at a time."""
-
-    def __init__(self, env: Push, options: Options):
-        self.env, self.options = env, options
-        self._law = OperationalSpace(env.mj_model, "tip", time_constant=TIME_CONSTANT, regularization=REGULARIZATION)
-
-    def action(self, state: State, velocity: jax.Array) -> jax.Array:
-        """Computes the actions [7], not clipped, that move the hand so (velocity [4]) and keep it upright."""
-        tilt = jnp.cross(self.env.hand(state.qpos)[6:9], jnp.array([0.0, 0.0, -1.0]))
-        wanted = jnp.concatenate([velocity[:3], UPRIGHT * tilt[:2], velocity[3:]])
-        # The objects' masses do not matter to the arm's law.
-        return self._law.command(self.env.model, self.env.data(state), wanted)
-
-    def problem(self, task: PushTask, start: State) -> Problem:
-        """States the problem of a scene, with the environment's costs, in velocities of the hand."""
-        problem = problem_of(self.env, task, start)
-        limits = jnp.array(LIMITS)
-        return with_controls(problem, lambda x, v: self.action(start.with_vector(x), v), -limits, limits)
-
-    @functools.partial(jax.jit, static_argnums=0)
-    def start_from(self, task: PushTask, start: State, plans: jax.Array) -> Search:
-        """Begins a search in every scene, from the cheapest of its own plans [scenes, PLANS, KNOTS, 4]."""
-
-        def one(task: PushTask, start: State, plans: jax.Array) -> Search:
-            problem, deviation = self.problem(task, start), NEAR * jnp.array(DEVIATION)
-            return sampling.start_from(problem, start.vector, plans, deviation, self.env.horizon, self.options)
-
-        return jax.vmap(one)(task, start, plans)
-
-    @functools.partial(jax.jit, static_argnums=0)
-    def improve(self, task: PushTask, start: State, search: Search, key: jax.Array) -> Search:
-        """Does one iteration in every scene."""
-
-        def one(task: PushTask, start: State, search: Search, key: jax.Array) -> Search:
-            problem = self.problem(task, start)
-            return sampling.solve(problem, start.vector, search, self.env.horizon, key, self.options)
-
-        return jax.vmap(one)(task, start, search, key)
-
-    @functools.partial(jax.jit, static_argnums=0)
-    def execute(
-        self,
-        task: PushTask,
-        start: State,
-        search: Search,
-        key: jax.Array,
-        noise: jax.Array,
-        rate: jax.Array,
-        path: jax.Array,
-    ) -> tuple[jax.Array, jax.Array]:
-        """Executes the plans.
-
-        Args:
-            task: [scenes].
-            start: [scenes], where they begin.
-            search: [scenes], their plans.
-            key: [scenes], for the noise.
-            noise: standard deviation on the actions, which lie in [-1, 1].
-            rate: at which the hand returns to its path (1/s); velocities that return it may exceed LIMITS.
-            path: [scenes, T, 4], x, y, z (m) and turn (rad) of the hand at the beginning of every time step.
-
-        Returns:
-            In which scenes that succeeded, and the paths [scenes, T, 4] of the hand.
-        """
-
-        def one(task: PushTask, start: State, search: Search, key: jax.Array, path: jax.Array):
-            controls = sampling.actions_of(self.problem(task, start), search.knots, self.env.horizon, self.options)
-
-            def step(x: jax.Array, inputs: tuple[jax.Array, jax.Array, jax.Array]):
-                velocity, wanted, key = inputs
-                hand = self.hand(start.with_vector(x))
-                away = wanted - hand
-                away = away.at[3].set(jnp.arctan2(jnp.sin(away[3]), jnp.cos(away[3])))
-                after = self._act(task, start.with_vector(x), velocity + rate * away, noise, key)
-                return after, (after, hand)
-
-            inputs = controls, path, jax.random.split(key, self.env.horizon)
-            _, (vectors, hands) = jax.lax.scan(step, start.vector, inputs)
-            return self._success(task, start, jnp.concatenate([start.vector[None], vectors])), hands
-
-        return jax.vmap(one)(task, start, search, key, path)
-
-    @functools.partial(jax.jit, static_argnums=0)
-    def replan(self, task: PushTask, start: State, search: Search, key: jax.Array) -> jax.Array:
-        """Tells in which scenes plans succeed under noise, if one iteration plans again every EVERY time steps.
-
-        It plans a whole horizon from there on, past the end of the episode. Moving the knots on changes a plan a little
-        unless EVERY is a multiple of their interval.
-        """
-
-        def one(task: PushTask, start: State, search: Search, key: jax.Array) -> jax.Array:
-            def plant(x: jax.Array, velocity: jax.Array, key: jax.Array) -> jax.Array:
-                return self._act(task, start.with_vector(x), velocity, NOISE, key)
-
-            horizon, problem = self.env.horizon, self.problem(task, start)
-            states, _ = sampling.control(
-                problem, start.vector, search, horizon, horizon, EVERY, key, self.options, plant
-            )
-            return self._success(task, start, states)
-
-        return jax.vmap(one)(task, start, search, key)
-
-    def hand(self, state: State) -> jax.Array:
-        """Returns x, y, z (m) of the hand, and its turn about z (rad)."""
-        hand = self.env.hand(state.qpos)
-        return jnp.append(hand[:3], jnp.arctan2(hand[4], hand[3]))
-
-    def _act(
-        self, task: PushTask, state: State, velocity: jax.Array, noise: jax.Array | float, key: jax.Array
-    ) -> jax.Array:
-        action = jnp.clip(self.action(state, velocity), *self.env.action_range)
-        return self.env.step(task, state, action + noise * jax.random.normal(key, action.shape)).vector
-
-    def _success(self, task: PushTask, start: State, vectors: jax.Array) -> jax.Array:
-        return self.env.success(task, jax.vmap(start.with_vector)(vectors))
-
-
 class Measurement:
     """Measures a planner in some scenes, which `seed` draws."""
 
     def __init__(self, planner: Planner, scenes: int, seed: int):
         self.planner, self.scenes = planner, scenes
-        task_key, scene_key, self._key = jax.random.split(jax.random.key(seed), 3)
-        env = planner.env
-        self.task = jax.vmap(env.sample_task, in_axes=(0, None))(jax.random.split(task_key, scenes), "train")
-        self.start = jax.vmap(env.reset)(jax.random.split(scene_key, scenes), self.task)
+        self.task, self.start, self._key = draw(planner.env, scenes, seed)
 
     def keys(self, number: int) -> jax.Array:
         """Returns a key for each scene."""
         return jax.random.split(jax.random.fold_in(self._key, number), self.scenes)
 
-    def execute(self, search: Search, noise: float, rate: float, path: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Executes the plans; see `Planner.execute`."""
-        return self.planner.execute(self.task, self.start, search, self.keys(1000), noise, rate, path)
-
-    def path(self, search: Search) -> tuple[jax.Array, jax.Array]:
-        """Tells which plans succeed without noise, and how the hand moves then."""
-        return self.execute(search, 0.0, 0.0, jnp.zeros((self.scenes, self.planner.env.horizon, 4)))
+    def execute(self, search: Search, every: int | None = None, noise: float = 0.0, rate: float = 0.0) -> jax.Array:
+        """Executes the plans; see `Planner.execute`. They are kept unless `every` is given."""
+        every = every or self.planner.env.horizon
+        return self.planner.execute(self.task, self.start, search, self.keys(1000), every, None, noise, rate)
 
     def plan(self, search: Search, iterations: int, rollouts: int) -> tuple[Search, list[dict[str, Any]]]:
         """Improves plans.
@@ -220,21 +78,18 @@ class Measurement:
         return search, curve
 
     def _point(self, search: Search, rollouts: int, seconds: float) -> dict[str, Any]:
-        found = {"rollouts": rollouts, "success": float(self.path(search)[0].mean()), "seconds": seconds}
+        found = {"rollouts": rollouts, "success": float(self.execute(search).mean()), "seconds": seconds}
         found["cheapest_cost"] = float(jnp.median(search.cost))
         print(found, flush=True)
         return found
 
     def under_noise(self, search: Search) -> dict[str, Any]:
-        """Executes plans under noise in three ways."""
-        path = self.path(search)[1]
-        deviation = jnp.broadcast_to(NEAR * jnp.array(DEVIATION), search.deviation.shape)
+        """Executes plans under noise in four ways."""
         ways = {
-            "open loop": lambda: self.execute(search, NOISE, 0.0, path)[0],
-            "tracking": lambda: self.execute(search, NOISE, TRACKING, path)[0],
-            f"planning again every {EVERY} steps": lambda: self.planner.replan(
-                self.task, self.start, search._replace(deviation=deviation), self.keys(2000)
-            ),
+            "open loop": lambda: self.execute(search, noise=NOISE),
+            "tracking": lambda: self.execute(search, noise=NOISE, rate=TRACKING),
+            f"planning again every {EVERY} steps": lambda: self.execute(search, EVERY, NOISE),
+            f"tracking, and planning again every {EVERY} steps": lambda: self.execute(search, EVERY, NOISE, TRACKING),
         }
         found = {}
         for way, execute in ways.items():
@@ -250,12 +105,10 @@ def measure(options: Options, scenes: int, iterations: int, more: int) -> dict[s
     Raises:
         RuntimeError: if no plan succeeds in the first scenes.
     """
-    planner = Planner(envs.make("push", (16, 16)), options)
+    planner = Planner(make_env(), options)
     first = Measurement(planner, scenes, 0)
-    begin = jax.vmap(sampling.start, in_axes=None, axis_size=scenes)
-    search = begin(jnp.zeros((KNOTS, 4)), jnp.array(DEVIATION))
-    search, from_nothing = first.plan(search, iterations, 0)
-    good = search.knots[first.path(search)[0]]
+    search, from_nothing = first.plan(planner.start(scenes), iterations, 0)
+    good = search.knots[first.execute(search)]
     if not len(good):
         raise RuntimeError(f"no plan of {scenes} scenes succeeded after {iterations} iterations")
     second = Measurement(planner, scenes, 1)

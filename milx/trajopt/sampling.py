@@ -29,7 +29,6 @@ References:
 """
 
 import dataclasses
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -131,7 +130,7 @@ def start_from(
         A search whose θ̄ and θ* are the cheapest plan; the first one if all diverge, with a cost of inf.
     """
     plans = jnp.clip(plans.astype(initial_state.dtype), problem.control_low, problem.control_high)
-    costs = _costs(problem, initial_state, plans, horizon, options)
+    costs = _costs(problem, initial_state, plans, horizon, options, 0)
     cheapest = jnp.argmin(costs)
     return start(plans[cheapest], deviation)._replace(cost=costs[cheapest])
 
@@ -146,7 +145,7 @@ def basis(order: int, steps: np.ndarray, horizon: int, knots: int) -> np.ndarray
     """
     if not 1 <= knots <= horizon:
         raise ValueError(f"knots: got {knots}, expected 1 to {horizon}, the time steps")
-    at, when = _times(order, horizon, knots), np.clip(steps, 0, horizon - 1)
+    at, when = knot_times(order, horizon, knots), np.clip(steps, 0, horizon - 1)
     if order == 0:
         return np.eye(knots)[np.floor(when * knots / horizon + _ROUNDING).astype(int)]
     if knots == 1:
@@ -156,7 +155,7 @@ def basis(order: int, steps: np.ndarray, horizon: int, knots: int) -> np.ndarray
     return scipy.interpolate.CubicSpline(at, np.eye(knots), bc_type="natural")(when)
 
 
-def _times(order: int, horizon: int, knots: int) -> np.ndarray:
+def knot_times(order: int, horizon: int, knots: int) -> np.ndarray:
     """Returns the time steps [K] of the knots."""
     return np.arange(knots) * horizon / knots if order == 0 else np.linspace(0, horizon - 1, knots)
 
@@ -167,29 +166,43 @@ def actions_of(problem: Problem, knots: jax.Array, horizon: int, options: Option
     return jnp.clip(rows @ knots, problem.control_low, problem.control_high)
 
 
-def _costs(problem: Problem, initial_state: jax.Array, knots: jax.Array, horizon: int, options: Options) -> jax.Array:
-    """Returns J [N] of candidates [N, K, m]."""
+def _costs(
+    problem: Problem,
+    initial_state: jax.Array,
+    knots: jax.Array,
+    horizon: int,
+    options: Options,
+    now: jax.Array | int,
+) -> jax.Array:
+    """Returns J [N] of candidates [N, K, m], from step `now` on."""
     actions = jax.vmap(lambda knots: actions_of(problem, knots, horizon, options))(knots)
-    return jax.vmap(lambda actions: _cost(problem, initial_state, actions))(actions)
+    return jax.vmap(lambda actions: _cost(problem, initial_state, actions, now))(actions)
 
 
-def _cost(problem: Problem, initial_state: jax.Array, actions: jax.Array) -> jax.Array:
-    """Rolls actions [T, m] out and returns J; inf if a state is not finite."""
+def _cost(problem: Problem, initial_state: jax.Array, actions: jax.Array, now: jax.Array | int) -> jax.Array:
+    """Rolls the actions [T, m] from step `now` on out and returns J; inf if a state is not finite."""
 
-    def step(x, inputs):
-        t, u = inputs
-        r = problem.running_residual(x, u, t)
-        after = problem.dynamics(x, u)
-        return after, (0.5 * r @ r, jnp.isfinite(after).all())
+    def step(t: jax.Array, rolled: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+        x, cost, finite = rolled
+        r = problem.running_residual(x, actions[t], t)
+        after = problem.dynamics(x, actions[t])
+        return after, cost + 0.5 * r @ r, finite & jnp.isfinite(after).all()
 
-    last, (costs, finite) = lax.scan(step, initial_state, (jnp.arange(len(actions), dtype=jnp.int32), actions))
+    begin = initial_state, jnp.zeros((), initial_state.dtype), jnp.array(True)
+    last, cost, finite = lax.fori_loop(now, len(actions), step, begin)
     r_T = problem.terminal_residual(last)
-    cost = costs.sum() + 0.5 * r_T @ r_T
-    return jnp.where(finite.all() & jnp.isfinite(cost), cost, jnp.inf)
+    cost = cost + 0.5 * r_T @ r_T
+    return jnp.where(finite & jnp.isfinite(cost), cost, jnp.inf)
 
 
 def solve(
-    problem: Problem, initial_state: jax.Array, search: Search, horizon: int, key: jax.Array, options: Options
+    problem: Problem,
+    initial_state: jax.Array,
+    search: Search,
+    horizon: int,
+    key: jax.Array,
+    options: Options,
+    now: jax.Array | int = 0,
 ) -> Search:
     """Goes on with a search from an initial state, in whose data type everything is computed.
 
@@ -197,11 +210,12 @@ def solve(
 
     Args:
         problem: what to solve; `approximation` is not used.
-        initial_state: x_0, [n].
+        initial_state: x_0, [n]; with `now`, the state at that step.
         search: around what to look.
         horizon: T.
         key: draws the candidates.
         options: settings.
+        now: the step from which on candidates are rolled out, the steps before it being done.
     """
 
     def iterate(search: Search, key: jax.Array) -> tuple[Search, None]:
@@ -210,7 +224,7 @@ def solve(
         kept = (search.best != search.knots).any()
         candidates = jnp.where(kept, candidates.at[1:2].set(search.best), candidates)
         candidates = jnp.clip(candidates, problem.control_low, problem.control_high)
-        costs = _costs(problem, initial_state, candidates, horizon, options)
+        costs = _costs(problem, initial_state, candidates, horizon, options, now)
         moved = UPDATES[options.update](search, candidates, costs, options)
         moved = moved._replace(best=candidates[jnp.argmin(costs)])
         least = costs.min()
@@ -240,70 +254,3 @@ def _mppi(search: Search, candidates: jax.Array, costs: jax.Array, options: Opti
 
 UPDATES = {"predictive": _predictive, "cross_entropy": _cross_entropy, "mppi": _mppi}
 """How the mean moves, by name."""
-
-
-def control(
-    problem: Problem,
-    initial_state: jax.Array,
-    search: Search,
-    horizon: int,
-    steps: int,
-    every: int,
-    key: jax.Array,
-    options: Options,
-    plant: Callable[[jax.Array, jax.Array, jax.Array], jax.Array] | None = None,
-) -> tuple[jax.Array, jax.Array]:
-    """Executes the first actions of a plan, plans again from where they lead, and so on (receding horizon).
-
-    The plan before is the next one's mean, moved on by the steps that were executed, and so is θ*; σ begins anew. A
-    running residual is given the time since the first step, up to S + T - `every` - 1.
-
-    Args:
-        problem: what is planned.
-        initial_state: x_0, [n].
-        search: the first one.
-        horizon: T, time steps that are planned ahead.
-        steps: S, time steps that are executed, a multiple of `every`.
-        every: time steps from one plan to the next.
-        key: draws candidates, and what `plant` draws.
-        options: settings.
-        plant: (x [n], u [m], key) -> next x [n], what happens; the problem's dynamics by default.
-
-    Returns:
-        States [S + 1, n] and actions [S, m].
-
-    Raises:
-        ValueError: if `steps` is not a multiple of `every`, or `every` is more than the horizon; if knots are held
-            (order 0) for so long that a plan cannot be moved on by `every` steps.
-    """
-    knots = len(search.knots)
-    if not 1 <= every <= horizon or steps % every:
-        raise ValueError(f"every: got {every}, expected a divisor of steps = {steps}, at most horizon = {horizon}")
-    if options.order == 0 and every * knots % horizon:
-        held = f"{horizon / knots:g} time steps, for which a knot is held"
-        raise ValueError(f"every: got {every}, expected a multiple of {held}")
-    happens = plant or (lambda x, u, key: problem.dynamics(x, u))
-    later = _times(options.order, horizon, knots) + every
-    search = jax.tree.map(lambda x: x.astype(initial_state.dtype), search)
-    moved = jnp.asarray(basis(options.order, later, horizon, knots), initial_state.dtype)
-
-    def act(x: jax.Array, inputs: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
-        u, key = inputs
-        after = happens(x, u, key)
-        return after, (after, u)
-
-    def replan(carry, inputs):
-        x, plan, best = carry
-        now, key = inputs
-        plan_key, act_key = jax.random.split(key)
-        ahead = problem._replace(running_residual=lambda x, u, t: problem.running_residual(x, u, now + t))
-        found = solve(ahead, x, search._replace(knots=plan, best=best), horizon, plan_key, options)
-        actions = actions_of(problem, found.knots, horizon, options)[:every]
-        x, executed = lax.scan(act, x, (actions, jax.random.split(act_key, every)))
-        return (x, moved @ found.knots, moved @ found.best), executed
-
-    times = jnp.arange(0, steps, every, dtype=jnp.int32)
-    inputs = times, jax.random.split(key, len(times))
-    _, (states, actions) = lax.scan(replan, (initial_state, search.knots, search.best), inputs)
-    states = jnp.concatenate([initial_state[None], states.reshape(steps, -1)])
-    return states, actions.reshape(steps, -1)

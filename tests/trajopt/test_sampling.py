@@ -7,7 +7,7 @@ import pytest
 import scipy.interpolate
 from linear_quadratic import bounded_least_squares, lq_problem, random_lq, riccati
 
-from milx.trajopt import sampling
+from milx.trajopt import replanning, sampling
 from milx.trajopt.sampling import Options
 
 
@@ -211,7 +211,7 @@ def test_planning_again_costs_less_where_things_turn_out_otherwise():
         return problem.dynamics(x, u) + 0.3 * jax.random.normal(key, x.shape)
 
     draws = jax.jit(
-        lambda key: sampling.control(
+        lambda key: replanning.control(
             problem, state, first, 12, 6, 2, key, options, lambda x, u, key: x + jax.random.normal(key, x.shape)
         )
     )
@@ -219,7 +219,7 @@ def test_planning_again_costs_less_where_things_turn_out_otherwise():
     assert len(np.unique(noise)) == noise.size
 
     def run(every, key):
-        states, actions = sampling.control(problem, state, first, 12, 12, every, key, options, plant)
+        states, actions = replanning.control(problem, state, first, 12, 12, every, key, options, plant)
         running = jax.vmap(problem.running_residual)(states[:-1], actions, jnp.arange(12))
         return 0.5 * jnp.sum(running**2) + 0.5 * jnp.sum(problem.terminal_residual(states[-1]) ** 2)
 
@@ -235,7 +235,7 @@ def test_a_plan_goes_on_where_the_one_before_stopped(order):
     knots, every = np.array([0.0, 0.8, -0.4]), (3, 2)[order]
     search = sampling.start(knots[:, None], 0.0)
     state, key, options = jnp.asarray(lq["x_0"]), jax.random.key(0), Options(samples=1, order=order)
-    states, actions = sampling.control(lq_problem(lq, np.inf), state, search, 9, 6, every, key, options)
+    states, actions = replanning.control(lq_problem(lq, np.inf), state, search, 9, 6, every, key, options)
     at = np.array([0.0, 4.0, 8.0])
     x = lq["x_0"]
     for t in range(6):
@@ -254,7 +254,7 @@ def test_the_cheapest_candidate_moves_on_with_the_plan():
     at, mean, kept = np.array([0.0, 4.0, 8.0]), np.array([0.0, 0.8, -0.4]), np.array([-0.1, 0.3, 0.2])
     search = sampling.start(mean[:, None], 0.0)._replace(best=jnp.asarray(kept[:, None]))
     options, key = Options("cross_entropy", samples=2, elites=2), jax.random.key(0)
-    _, actions = sampling.control(lq_problem(lq, np.inf), jnp.asarray(lq["x_0"]), search, 9, 4, 2, key, options)
+    _, actions = replanning.control(lq_problem(lq, np.inf), jnp.asarray(lq["x_0"]), search, 9, 4, 2, key, options)
     best = min(mean, kept, key=lambda knots: cost(lq, np.interp(np.arange(9), at, knots)[:, None]))
     first = (mean + kept) / 2
     second = (np.interp(at + 2, at, first) + np.interp(at + 2, at, best)) / 2
@@ -283,6 +283,6 @@ def test_settings_that_make_no_sense_are_refused():
         (10, 2, 0, "every: got 2, expected a multiple of 5 time steps, for which a knot is held"),
     ):
         with pytest.raises(ValueError, match=message):
-            sampling.control(
+            replanning.control(
                 lq_problem(lq, 1.0), lq["x_0"], first, 15, steps, every, jax.random.key(0), Options(order=order)
             )

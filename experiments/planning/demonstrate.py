@@ -1,0 +1,117 @@
+"""Many demonstrations of push by sampling alone: how many succeed under noise, and how long they take to plan.
+
+    python experiments/planning/demonstrate.py                     # 9,200 scenes on a GPU
+    python experiments/planning/demonstrate.py --scenes=4 --batch=4 --plans=2
+
+Scenes come in batches. The first one is searched from nothing, to have plans to begin with; then every batch, the first
+one again included, begins with the cheapest of the plans of its nearest scenes, is improved, and is executed under the
+presets' noise, tracking the plan and planning what is left of it again every few time steps. The plans of executions
+that succeeded join the others. Candidates are rolled out in the cheap model, and executed in the environment.
+"""
+
+import pathlib
+import time
+from typing import Any
+
+import jax
+import numpy as np
+from absl import app, flags
+from planner import TRACKING, Planner, draw, make_cheap_env, make_env, nearest
+
+import milx
+from milx.core import files
+from milx.evaluation import provenance
+from milx.evaluation.intervals import wilson_interval
+from milx.trajopt.sampling import Options, Search
+
+NOISE = 0.1
+"""Standard deviation on the actions; the presets'."""
+ITERATIONS, ROUNDS = 4, 6
+"""Iterations of a batch, and how many times as many the first batch has from nothing."""
+EVERY = 20
+"""Time steps from one plan to the next."""
+SEARCH = Options("cross_entropy", samples=32, elites=6, order=3, deviation_min=0.03, iterations=ITERATIONS)
+AGAIN = Options("predictive", samples=32, order=3)
+
+
+def measure(scenes: int, batch: int, plans: int) -> dict[str, Any]:
+    """Plans and executes `scenes` scenes, rounded up to whole batches.
+
+    Raises:
+        RuntimeError: if fewer than `plans` plans of the first batch succeed.
+    """
+    env = make_env()
+    planner = Planner(env, SEARCH, make_cheap_env())
+    began = time.perf_counter()
+    seconds: dict[str, float] = {}
+
+    def done(what: str, since: float) -> None:
+        seconds[what] = seconds.get(what, 0.0) + time.perf_counter() - since
+
+    features, knots = _from_nothing(planner, batch)
+    if len(knots) < plans:
+        raise RuntimeError(f"only {len(knots)} plans of the first {batch} scenes succeeded, expected {plans}")
+    done("the first batch from nothing, with compilation", began)
+    counts, clean = [], 0
+    for number in range(-(-scenes // batch)):
+        task, start, key = draw(env, batch, number)
+        keys = jax.random.split(key, (2, batch))
+        found = planner.features(task, start)
+        since = time.perf_counter()
+        search = planner.start_from(task, start, knots[nearest(found, features, plans)])
+        search = jax.block_until_ready(planner.improve(task, start, search, keys[0]))
+        done("planning", since)
+        since = time.perf_counter()
+        success = np.asarray(planner.execute(task, start, search, keys[1], EVERY, AGAIN, NOISE, TRACKING))
+        done("executing", since)
+        features = np.concatenate([features, np.asarray(found)[success]])
+        knots = np.concatenate([knots, np.asarray(search.knots)[success]])
+        counts.append(int(success.sum()))
+        print(f"batch {number}: {counts[-1] / batch:.1%}, {time.perf_counter() - began:.0f} s", flush=True)
+    total, made = time.perf_counter() - began, batch * len(counts)
+    return {
+        "scenes": made,
+        "success": sum(counts) / made,
+        "wilson95": wilson_interval(sum(counts), made),
+        "success_by_batch": [count / batch for count in counts],
+        "seconds": {**seconds, "total": total},
+        "scenes_per_second": made / total,
+        "rollouts": {"from_plans": plans, "search": ITERATIONS * SEARCH.samples, "again": _again(env.horizon)},
+    }
+
+
+def _again(horizon: int) -> float:
+    """Counts the rollouts of planning again, in whole episodes."""
+    return AGAIN.samples * sum((horizon - now) / horizon for now in range(EVERY, horizon, EVERY))
+
+
+def _from_nothing(planner: Planner, batch: int) -> tuple[np.ndarray, np.ndarray]:
+    """Searches from nothing, and returns features and knots of the scenes whose plans succeed without noise."""
+    task, start, key = draw(planner.env, batch, 0)
+    search: Search = planner.start(batch)
+    for number in range(ROUNDS):
+        search = planner.improve(task, start, search, jax.random.split(jax.random.fold_in(key, number), batch))
+    success = np.asarray(planner.execute(task, start, search, jax.random.split(key, batch), EVERY, AGAIN, 0.0, 0.0))
+    return np.asarray(planner.features(task, start))[success], np.asarray(search.knots)[success]
+
+
+def main(_: list[str]) -> None:
+    """Measures, and writes the file."""
+    milx.configure()
+    settings = {"plans": _PLANS.value, "batch": _BATCH.value, "every": EVERY, "noise": NOISE, "tracking": TRACKING}
+    found = measure(_SCENES.value, _BATCH.value, _PLANS.value)
+    folder = pathlib.Path(_OUT.value)
+    folder.mkdir(parents=True, exist_ok=True)
+    options = {"search": vars(SEARCH), "again": vars(AGAIN)}
+    result = {"planner": "demonstrations", "settings": settings, "options": options, **found, **provenance.origin()}
+    files.write_json(folder / "demonstrations.json", result)
+    low, high = found["wilson95"]
+    print(f"{found['success']:.2%} ({low:.2%} to {high:.2%}) of {found['scenes']}, {found['seconds']}")
+
+
+if __name__ == "__main__":
+    _SCENES = flags.DEFINE_integer("scenes", 9200, "Scenes, each of another task.", lower_bound=1)
+    _BATCH = flags.DEFINE_integer("batch", 512, "Scenes at once.", lower_bound=1)
+    _PLANS = flags.DEFINE_integer("plans", 64, "Plans of other scenes that a scene tries.", lower_bound=1)
+    _OUT = flags.DEFINE_string("out", "experiments/results/planning", "Folder of the JSON file.")
+    app.run(main)
