@@ -20,15 +20,17 @@ from planner import TRACKING, Planner, draw, make_cheap_env, make_env, nearest
 
 import milx
 from milx.core import files
+from milx.envs.base import State
+from milx.envs.push.env import PushTask
 from milx.evaluation import provenance
 from milx.evaluation.intervals import wilson_interval
 from milx.trajopt.sampling import Options, Search
 
 NOISE = 0.1
 """Standard deviation on the actions; the presets'."""
-ITERATIONS, ROUNDS = 4, 6
-"""Iterations of a batch, and how many times as many the first batch has from nothing."""
-EVERY = 20
+ITERATIONS, ROUNDS, ROUNDS_FROM_NOTHING = 4, 2, 6
+"""Iterations of a round, and how many rounds a batch has from plans, and the first one from nothing."""
+EVERY = 10
 """Time steps from one plan to the next."""
 SEARCH = Options("cross_entropy", samples=32, elites=6, order=3, deviation_min=0.03, iterations=ITERATIONS)
 AGAIN = Options("predictive", samples=32, order=3)
@@ -55,14 +57,16 @@ def measure(scenes: int, batch: int, plans: int) -> dict[str, Any]:
     counts, clean = [], 0
     for number in range(-(-scenes // batch)):
         task, start, key = draw(env, batch, number)
-        keys = jax.random.split(key, (2, batch))
+        keys = jax.random.split(key)
         found = planner.features(task, start)
         since = time.perf_counter()
         search = planner.start_from(task, start, knots[nearest(found, features, plans)])
-        search = jax.block_until_ready(planner.improve(task, start, search, keys[0]))
+        search = jax.block_until_ready(_improve(planner, task, start, search, keys[0], ROUNDS))
         done("planning", since)
         since = time.perf_counter()
-        success = np.asarray(planner.execute(task, start, search, keys[1], EVERY, AGAIN, NOISE, TRACKING))
+        success = np.asarray(
+            planner.execute(task, start, search, jax.random.split(keys[1], batch), EVERY, AGAIN, NOISE, TRACKING)
+        )
         done("executing", since)
         features = np.concatenate([features, np.asarray(found)[success]])
         knots = np.concatenate([knots, np.asarray(search.knots)[success]])
@@ -76,7 +80,7 @@ def measure(scenes: int, batch: int, plans: int) -> dict[str, Any]:
         "success_by_batch": [count / batch for count in counts],
         "seconds": {**seconds, "total": total},
         "scenes_per_second": made / total,
-        "rollouts": {"from_plans": plans, "search": ITERATIONS * SEARCH.samples, "again": _again(env.horizon)},
+        "rollouts": {"from_plans": plans, "search": ROUNDS * ITERATIONS * SEARCH.samples, "again": _again(env.horizon)},
     }
 
 
@@ -85,12 +89,17 @@ def _again(horizon: int) -> float:
     return AGAIN.samples * sum((horizon - now) / horizon for now in range(EVERY, horizon, EVERY))
 
 
+def _improve(planner: Planner, task: PushTask, start: State, search: Search, key: jax.Array, rounds: int) -> Search:
+    """Improves plans in every scene."""
+    for key in jax.random.split(key, rounds):
+        search = planner.improve(task, start, search, jax.random.split(key, len(search.knots)))
+    return search
+
+
 def _from_nothing(planner: Planner, batch: int) -> tuple[np.ndarray, np.ndarray]:
     """Searches from nothing, and returns features and knots of the scenes whose plans succeed without noise."""
     task, start, key = draw(planner.env, batch, 0)
-    search: Search = planner.start(batch)
-    for number in range(ROUNDS):
-        search = planner.improve(task, start, search, jax.random.split(jax.random.fold_in(key, number), batch))
+    search = _improve(planner, task, start, planner.start(batch), key, ROUNDS_FROM_NOTHING)
     success = np.asarray(planner.execute(task, start, search, jax.random.split(key, batch), EVERY, AGAIN, 0.0, 0.0))
     return np.asarray(planner.features(task, start))[success], np.asarray(search.knots)[success]
 
