@@ -3,14 +3,15 @@
     python experiments/planning/demonstrate.py                     # 9,200 scenes on a GPU
     python experiments/planning/demonstrate.py --scenes=4 --batch=4 --plans=2
 
-Scenes come in batches. The first one is searched from nothing, to have plans to begin with; then every batch, the first
-one again included, begins with the cheapest of the plans of its nearest scenes, is improved, and is executed under the
-presets' noise, tracking the plan and planning what is left of it again every few time steps. The plans of executions
-that succeeded join the others. Candidates are rolled out in the cheap model, and executed in the environment.
+A first batch of scenes is searched from nothing, to have plans to begin with, and does not count. Every other batch
+begins with the cheapest of the plans of its nearest scenes, is improved, and is executed under the presets' noise,
+tracking the plan and planning what is left of it again every few time steps. The plans of executions that succeeded
+join the others. Candidates are rolled out in the cheap model; what is executed happens in the environment.
 """
 
 import pathlib
 import time
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -29,15 +30,15 @@ from milx.trajopt.sampling import Options, Search
 NOISE = 0.1
 """Standard deviation on the actions; the presets'."""
 ITERATIONS, ROUNDS, ROUNDS_FROM_NOTHING = 4, 2, 6
-"""Iterations of a round, and how many rounds a batch has from plans, and the first one from nothing."""
+"""Iterations of a round, and how many rounds a batch has that begins with plans, and the first one from nothing."""
 EVERY = 10
 """Time steps from one plan to the next."""
 SEARCH = Options("cross_entropy", samples=32, elites=6, order=3, deviation_min=0.03, iterations=ITERATIONS)
 AGAIN = Options("predictive", samples=32, order=3)
 
 
-def measure(scenes: int, batch: int, plans: int) -> dict[str, Any]:
-    """Plans and executes `scenes` scenes, rounded up to whole batches.
+def measure(scenes: int, batch: int, plans: int) -> Iterator[dict[str, Any]]:
+    """Plans and executes `scenes` scenes, rounded up to whole batches, and yields what is known after each batch.
 
     Raises:
         RuntimeError: if fewer than `plans` plans of the first batch succeed.
@@ -54,9 +55,9 @@ def measure(scenes: int, batch: int, plans: int) -> dict[str, Any]:
     if len(knots) < plans:
         raise RuntimeError(f"only {len(knots)} plans of the first {batch} scenes succeeded, expected {plans}")
     done("the first batch from nothing, with compilation", began)
-    counts, clean = [], 0
+    counts: list[int] = []
     for number in range(-(-scenes // batch)):
-        task, start, key = draw(env, batch, number)
+        task, start, key = draw(env, batch, 1 + number)
         keys = jax.random.split(key)
         found = planner.features(task, start)
         since = time.perf_counter()
@@ -71,17 +72,20 @@ def measure(scenes: int, batch: int, plans: int) -> dict[str, Any]:
         features = np.concatenate([features, np.asarray(found)[success]])
         knots = np.concatenate([knots, np.asarray(search.knots)[success]])
         counts.append(int(success.sum()))
-        print(f"batch {number}: {counts[-1] / batch:.1%}, {time.perf_counter() - began:.0f} s", flush=True)
-    total, made = time.perf_counter() - began, batch * len(counts)
-    return {
-        "scenes": made,
-        "success": sum(counts) / made,
-        "wilson95": wilson_interval(sum(counts), made),
-        "success_by_batch": [count / batch for count in counts],
-        "seconds": {**seconds, "total": total},
-        "scenes_per_second": made / total,
-        "rollouts": {"from_plans": plans, "search": ROUNDS * ITERATIONS * SEARCH.samples, "again": _again(env.horizon)},
-    }
+        total, made = time.perf_counter() - began, batch * len(counts)
+        yield {
+            "scenes": made,
+            "success": sum(counts) / made,
+            "wilson95": wilson_interval(sum(counts), made),
+            "success_by_batch": [count / batch for count in counts],
+            "seconds": {**seconds, "total": total},
+            "scenes_per_second": made / total,
+            "rollouts": {
+                "from plans": plans,
+                "search": ROUNDS * ITERATIONS * SEARCH.samples,
+                "again": _again(env.horizon),
+            },
+        }
 
 
 def _again(horizon: int) -> float:
@@ -91,8 +95,8 @@ def _again(horizon: int) -> float:
 
 def _improve(planner: Planner, task: PushTask, start: State, search: Search, key: jax.Array, rounds: int) -> Search:
     """Improves plans in every scene."""
-    for key in jax.random.split(key, rounds):
-        search = planner.improve(task, start, search, jax.random.split(key, len(search.knots)))
+    for round_key in jax.random.split(key, rounds):
+        search = planner.improve(task, start, search, jax.random.split(round_key, len(search.knots)))
     return search
 
 
@@ -108,14 +112,15 @@ def main(_: list[str]) -> None:
     """Measures, and writes the file."""
     milx.configure()
     settings = {"plans": _PLANS.value, "batch": _BATCH.value, "every": EVERY, "noise": NOISE, "tracking": TRACKING}
-    found = measure(_SCENES.value, _BATCH.value, _PLANS.value)
+    options = {"search": vars(SEARCH), "again": vars(AGAIN)}
     folder = pathlib.Path(_OUT.value)
     folder.mkdir(parents=True, exist_ok=True)
-    options = {"search": vars(SEARCH), "again": vars(AGAIN)}
-    result = {"planner": "demonstrations", "settings": settings, "options": options, **found, **provenance.origin()}
-    files.write_json(folder / "demonstrations.json", result)
-    low, high = found["wilson95"]
-    print(f"{found['success']:.2%} ({low:.2%} to {high:.2%}) of {found['scenes']}, {found['seconds']}")
+    for found in measure(_SCENES.value, _BATCH.value, _PLANS.value):
+        result = {"planner": "demonstrations", "settings": settings, "options": options, **found, **provenance.origin()}
+        files.write_json(folder / "demonstrations.json", result)
+        low, high = found["wilson95"]
+        newest, total = found["success_by_batch"][-1], found["seconds"]["total"]
+        print(f"{newest:.1%}; {found['success']:.2%} ({low:.2%} to {high:.2%}) of {found['scenes']} in {total:.0f} s")
 
 
 if __name__ == "__main__":

@@ -5,8 +5,8 @@
 
 The planner samples velocities of the hand, which an operational-space law turns into torques. It plans whole episodes
 for an arm without noise: in the first scenes from nothing, in other scenes from the cheapest of a few plans that are
-drawn among those that succeeded in the first. Then it executes these under the presets' noise on the actions, in three
-ways: as they are, tracking the path of the hand without noise, or planning again every EVERY time steps.
+drawn among those that succeeded in the first. Then it executes these under the presets' noise on the actions, in four
+ways: as they are, tracking the path of the hand without noise, planning the rest again every EVERY time steps, or both.
 """
 
 import functools
