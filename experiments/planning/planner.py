@@ -40,10 +40,10 @@ def make_env() -> Push:
 
 
 def make_cheap_env() -> Push:
-    """Makes the environment with three physics steps in a time step instead of five, and a third of the solver's work.
+    """Makes the environment with cheaper physics.
 
-    A control step of 0.05 s takes steps of 0.0167 s instead of 0.01 s, and the contact solver does two iterations with
-    four evaluations in each line search instead of six with eight.
+    A time step of 0.05 s has three physics steps of 0.0167 s instead of five of 0.01 s, and the contact solver does two
+    iterations with at most four evaluations in each line search instead of six with eight.
     """
     env = make_env()
     step = env.mj_model.opt.timestep * env.substeps / 3
@@ -118,9 +118,11 @@ class Planner:
             search: [scenes], their plans.
             key: [scenes], for noise and candidates.
             every: time steps after which what is left is planned again; the horizon to keep the plans.
-            again: how it is planned again, with candidates that deviate by NEAR of DEVIATION; None as the plans were.
+            again: settings of planning again, whose candidates deviate by NEAR of DEVIATION; None for the planner's
+                own.
             noise: standard deviation on the actions, which lie in [-1, 1].
-            rate: at which the hand returns to its path (1/s); velocities that return it may exceed LIMITS.
+            rate: at which the hand returns to the path that the model expects of the last plan (1/s); velocities that
+                return it may exceed LIMITS.
 
         Returns:
             In which scenes that succeeded, [scenes].
@@ -135,7 +137,7 @@ class Planner:
                 return self.env.step(task, state, action + noise * jax.random.normal(key, action.shape)).vector
 
             search = search._replace(deviation=jnp.broadcast_to(NEAR * jnp.array(DEVIATION), search.deviation.shape))
-            states, _ = replanning.follow(
+            states, _ = replanning.execute(
                 self.problem(task, start),
                 start.vector,
                 search,
@@ -151,7 +153,7 @@ class Planner:
 
     @functools.partial(jax.jit, static_argnums=0)
     def features(self, task: PushTask, start: State) -> jax.Array:
-        """Describes scenes by what their costs begin with, the residual without an action: [scenes, R]."""
+        """Describes each scene by the running residual [scenes, R] of its first state, without an action."""
         zero = jnp.zeros(self.env.action_size)
         return jax.vmap(lambda task, start: self.env.running_residual(task, start, zero, jnp.int32(0)))(task, start)
 
@@ -176,7 +178,9 @@ def nearest(features: jax.Array, others: np.ndarray, count: int) -> np.ndarray:
     """
     if len(others) < count:
         raise ValueError(f"count: got {count}, expected at most {len(others)}, the plans that there are")
-    squares = (others**2).sum(axis=1) - 2 * np.asarray(features) @ others.T  # less the features' own, equal in a row
+    squares = (others**2).sum(axis=1) - 2 * np.asarray(
+        features
+    ) @ others.T  # the features' own squares are the same in a row
     return np.argpartition(squares, count - 1, axis=1)[:, :count]
 
 

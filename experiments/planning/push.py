@@ -88,8 +88,10 @@ class Measurement:
         ways = {
             "open loop": lambda: self.execute(search, noise=NOISE),
             "tracking": lambda: self.execute(search, noise=NOISE, rate=TRACKING),
-            f"planning again every {EVERY} steps": lambda: self.execute(search, EVERY, NOISE),
-            f"tracking, and planning again every {EVERY} steps": lambda: self.execute(search, EVERY, NOISE, TRACKING),
+            f"planning the rest again every {EVERY} steps": lambda: self.execute(search, EVERY, NOISE),
+            f"tracking, and planning the rest again every {EVERY} steps": lambda: self.execute(
+                search, EVERY, NOISE, TRACKING
+            ),
         }
         found = {}
         for way, execute in ways.items():

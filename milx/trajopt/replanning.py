@@ -1,7 +1,7 @@
 """Planning again while a plan by `sampling.py` is executed, where things turn out otherwise than planned.
 
-`control` looks T steps ahead all the time (receding horizon), for tasks without an end. `follow` executes one plan of T
-steps to its end and plans the rest of it again every few steps.
+`control` always looks T steps ahead (receding horizon), for tasks without an end. `execute` executes one plan of T
+steps to its end, and plans what is left of it again every few steps (shrinking horizon).
 """
 
 from collections.abc import Callable
@@ -81,7 +81,7 @@ def control(
     return states, actions.reshape(steps, -1)
 
 
-def follow(
+def execute(
     problem: Problem,
     initial_state: jax.Array,
     search: Search,
@@ -91,21 +91,22 @@ def follow(
     options: Options,
     plant: Callable[[jax.Array, jax.Array, jax.Array, jax.Array], jax.Array] | None = None,
 ) -> tuple[jax.Array, jax.Array]:
-    """Executes a plan, and plans what is left of it again every `every` steps, from where they have led.
+    """Executes a plan to its end, and plans what is left again every `every` steps, from the state reached by then.
 
-    Each time a search goes on around the plan before, with the deviation of the given one; the first steps are executed
-    as given.
+    Each time a search goes on around the last plan, θ* included, with the deviation of the given one. Before the first
+    steps nothing is planned.
 
     Args:
         problem: what is planned.
         initial_state: x_0, [n].
         search: the plan.
         horizon: T, its time steps, all of which are executed.
-        every: time steps from one plan to the next, a divisor of the horizon; the horizon to keep the plan.
+        every: time steps from one plan to the next, a divisor of the horizon; the horizon itself to keep the plan.
         key: draws candidates, and what `plant` draws.
-        options: settings.
-        plant: (x [n], u [m], x̂ [n], key) -> next x [n], what happens, where x̂ is the state that the last plan expects
-            now, so that a feedback law can return to it; the problem's dynamics by default.
+        options: settings of planning again, with the order of the given plan's spline.
+        plant: (x [n], u [m], x̂ [n], key) -> next x [n], what happens; the problem's dynamics by default. x̂ is where the
+            problem's dynamics take the last plan from the state in which it was made, so that a feedback law can return
+            to it.
 
     Returns:
         States [T + 1, n] and actions [T, m].
@@ -129,8 +130,9 @@ def follow(
         x, plan = carry
         now, key = inputs
         plan_key, act_key = jax.random.split(key)
-        again = lambda: solve(problem, x, plan, horizon, plan_key, options, now)._replace(deviation=search.deviation)  # noqa: E731
-        plan = lax.cond(now > 0, again, lambda: plan)
+        if every < horizon:
+            again = lambda: solve(problem, x, plan, horizon, plan_key, options, now)  # noqa: E731
+            plan = lax.cond(now > 0, again, lambda: plan)._replace(deviation=search.deviation)
         actions = lax.dynamic_slice_in_dim(actions_of(problem, plan.knots, horizon, options), now, every)
         (x, _), executed = lax.scan(act, (x, x), (actions, jax.random.split(act_key, every)))
         return (x, plan), executed

@@ -184,7 +184,7 @@ def _cost(problem: Problem, initial_state: jax.Array, actions: jax.Array, now: j
 
     def step(t: jax.Array, rolled: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
         x, cost, finite = rolled
-        r = problem.running_residual(x, actions[t], t)
+        r = problem.running_residual(x, actions[t], t.astype(jnp.int32))
         after = problem.dynamics(x, actions[t])
         return after, cost + 0.5 * r @ r, finite & jnp.isfinite(after).all()
 
@@ -212,10 +212,11 @@ def solve(
         problem: what to solve; `approximation` is not used.
         initial_state: x_0, [n]; with `now`, the state at that step.
         search: around what to look.
-        horizon: T.
+        horizon: T, time steps of a whole plan.
         key: draws the candidates.
         options: settings.
-        now: the step from which on candidates are rolled out, the steps before it being done.
+        now: the step at which candidates begin; J_i then adds up the running costs from there on, and the terminal
+            cost. All knots vary, since a spline's later actions may depend on earlier knots.
     """
 
     def iterate(search: Search, key: jax.Array) -> tuple[Search, None]:

@@ -34,6 +34,15 @@ def lq_problem(lq, limit):
     )
 
 
+def cost(lq, actions, x=None, now=0):
+    """Adds up J in a loop, from step `now` on if the state x at that step is given."""
+    x, total = lq["x_0"] if x is None else x, 0.0
+    for u, reference in zip(actions, lq["reference"][now:], strict=True):
+        total += 0.5 * np.sum((lq["S"] @ (x - reference)) ** 2) + 0.5 * np.sum((lq["R"] @ u) ** 2)
+        x = lq["A"] @ x + lq["B"] @ u
+    return total + 0.5 * np.sum((lq["S_T"] @ x) ** 2)
+
+
 def riccati(lq):
     """Solves the discrete Riccati recursion of the tracking problem: states, actions and gains."""
     A, B, R, Q = lq["A"], lq["B"], lq["R"].T @ lq["R"], lq["S"].T @ lq["S"]

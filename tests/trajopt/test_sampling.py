@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.interpolate
-from linear_quadratic import bounded_least_squares, lq_problem, random_lq, riccati
+from linear_quadratic import bounded_least_squares, cost, lq_problem, random_lq, riccati
 
-from milx.trajopt import replanning, sampling
+from milx.trajopt import sampling
 from milx.trajopt.sampling import Options
 
 
@@ -15,15 +15,6 @@ from milx.trajopt.sampling import Options
 def float64():
     with jax.enable_x64(True):
         yield
-
-
-def cost(lq, actions):
-    """Adds up J in a loop."""
-    x, total = lq["x_0"], 0.0
-    for u, reference in zip(actions, lq["reference"], strict=True):
-        total += 0.5 * np.sum((lq["S"] @ (x - reference)) ** 2) + 0.5 * np.sum((lq["R"] @ u) ** 2)
-        x = lq["A"] @ x + lq["B"] @ u
-    return total + 0.5 * np.sum((lq["S_T"] @ x) ** 2)
 
 
 def plan(lq, options, limit=np.inf, deviation=1.0, seed=0):
@@ -199,69 +190,6 @@ def test_float32_finds_nearly_what_float64_does():
     assert cost(lq, np.asarray(found.knots, np.float64)) < best + 1e-2 * (cost(lq, np.zeros((6, 1))) - best)
 
 
-def test_planning_again_costs_less_where_things_turn_out_otherwise():
-    """Executes one plan to its end, and replans every second step, under the same disturbances."""
-    lq = random_lq(1, T=12, n=3, m=2)
-    lq["reference"] = np.concatenate([lq["reference"], np.zeros((12, 3))])
-    problem, state = lq_problem(lq, np.inf), jnp.asarray(lq["x_0"])
-    options = Options("cross_entropy", samples=64, elites=8, iterations=10, order=0)
-    first = sampling.start(jnp.zeros((12, 2)), 1.0)
-
-    def plant(x, u, key):
-        return problem.dynamics(x, u) + 0.3 * jax.random.normal(key, x.shape)
-
-    draws = jax.jit(
-        lambda key: replanning.control(
-            problem, state, first, 12, 6, 2, key, options, lambda x, u, key: x + jax.random.normal(key, x.shape)
-        )
-    )
-    noise = np.diff(draws(jax.random.key(0))[0], axis=0)
-    assert len(np.unique(noise)) == noise.size
-
-    def run(every, key):
-        states, actions = replanning.control(problem, state, first, 12, 12, every, key, options, plant)
-        running = jax.vmap(problem.running_residual)(states[:-1], actions, jnp.arange(12))
-        return 0.5 * jnp.sum(running**2) + 0.5 * jnp.sum(problem.terminal_residual(states[-1]) ** 2)
-
-    keys = jax.random.split(jax.random.key(0), 20)
-    once, often = (np.asarray(jax.jit(jax.vmap(lambda key, every=every: run(every, key)))(keys)) for every in (12, 2))
-    assert often.mean() + 2 * (often - once).std() / np.sqrt(20) < once.mean()
-
-
-@pytest.mark.parametrize("order", [0, 1])
-def test_a_plan_goes_on_where_the_one_before_stopped(order):
-    """Executes a plan that no candidate disturbs; NumPy moves its knots on, and holds the last one."""
-    lq = random_lq(0, T=9, n=2, m=1)
-    knots, every = np.array([0.0, 0.8, -0.4]), (3, 2)[order]
-    search = sampling.start(knots[:, None], 0.0)
-    state, key, options = jnp.asarray(lq["x_0"]), jax.random.key(0), Options(samples=1, order=order)
-    states, actions = replanning.control(lq_problem(lq, np.inf), state, search, 9, 6, every, key, options)
-    at = np.array([0.0, 4.0, 8.0])
-    x = lq["x_0"]
-    for t in range(6):
-        if t and t % every == 0:
-            knots = np.interp(at + 2, at, knots) if order else np.append(knots[1:], knots[-1])
-        expected = np.interp(t % every, at, knots) if order else knots[0]
-        np.testing.assert_allclose(actions[t], [expected], atol=1e-9)
-        np.testing.assert_allclose(states[t], x, atol=1e-9)
-        x = lq["A"] @ x + lq["B"] @ actions[t]
-    np.testing.assert_allclose(states[6], x, atol=1e-9)
-
-
-def test_the_cheapest_candidate_moves_on_with_the_plan():
-    """Both candidates, the mean and the cheapest one, are elites; NumPy averages them and moves them on."""
-    lq = random_lq(0, T=9, n=2, m=1)
-    at, mean, kept = np.array([0.0, 4.0, 8.0]), np.array([0.0, 0.8, -0.4]), np.array([-0.1, 0.3, 0.2])
-    search = sampling.start(mean[:, None], 0.0)._replace(best=jnp.asarray(kept[:, None]))
-    options, key = Options("cross_entropy", samples=2, elites=2), jax.random.key(0)
-    _, actions = replanning.control(lq_problem(lq, np.inf), jnp.asarray(lq["x_0"]), search, 9, 4, 2, key, options)
-    best = min(mean, kept, key=lambda knots: cost(lq, np.interp(np.arange(9), at, knots)[:, None]))
-    first = (mean + kept) / 2
-    second = (np.interp(at + 2, at, first) + np.interp(at + 2, at, best)) / 2
-    expected = np.concatenate([np.interp([0, 1], at, first), np.interp([0, 1], at, second)])
-    np.testing.assert_allclose(actions[:, 0], expected, atol=1e-9)
-
-
 def test_settings_that_make_no_sense_are_refused():
     for settings, message in (
         ({"update": "best"}, "update: got 'best', expected one of predictive, cross_entropy, mppi"),
@@ -275,14 +203,3 @@ def test_settings_that_make_no_sense_are_refused():
             Options(**settings)
     with pytest.raises(ValueError, match="knots: got 9, expected 1 to 8, the time steps"):
         sampling.basis(0, np.arange(8), 8, 9)
-    lq = random_lq(0)
-    first = sampling.start(jnp.zeros((3, 2)), 1.0)
-    for steps, every, order, message in (
-        (10, 4, 1, "every: got 4, expected a divisor of steps = 10, at most horizon = 15"),
-        (10, 0, 1, "every: got 0, expected a divisor of steps = 10, at most horizon = 15"),
-        (10, 2, 0, "every: got 2, expected a multiple of 5 time steps, for which a knot is held"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            replanning.control(
-                lq_problem(lq, 1.0), lq["x_0"], first, 15, steps, every, jax.random.key(0), Options(order=order)
-            )
