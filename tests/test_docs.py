@@ -15,9 +15,9 @@ from milx.config import registry
 
 DOCS = pathlib.Path(__file__).parents[1] / "docs"
 FIXTURES = pathlib.Path(__file__).parent / "fixtures"
-
-
 PAGES = sorted(DOCS.rglob("*.md"))
+SLOW = ("render", "your_own_demonstrations")
+"""Names of pages whose blocks take more than ten seconds."""
 
 
 def blocks(path, language):
@@ -37,7 +37,7 @@ def registries():
 @pytest.mark.parametrize(
     "path",
     [
-        pytest.param(path, marks=[pytest.mark.slow] if path.stem == "your_own_demonstrations" else [], id=path.stem)
+        pytest.param(path, marks=[pytest.mark.slow] if path.stem in SLOW else [], id=path.stem)
         for path in PAGES
         if blocks(path, "python")
     ],

@@ -1,0 +1,181 @@
+"""The cross-entropy method beside hydrax: what its plans cost, and rollouts per second, in one scene of push.
+
+    pip install git+https://github.com/vincekurtz/hydrax
+    python experiments/benchmarks/planning.py
+    python experiments/benchmarks/planning.py --samples=16 --iterations=2 --seeds=1 --repeats=1
+
+Both search torques of the seven motors, as a linear spline of ten knots for the whole episode, from zero, with the same
+physics, costs, deviations and numbers of candidates and elites. milx searches velocities of the hand besides, in the
+environment and in a cheaper model of it (experiments/planning/planner.py). What the means of all searches cost in the
+end is computed in the environment, by one program for torques and one for velocities.
+"""
+
+import pathlib
+import statistics
+import sys
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import common
+import jax
+import jax.numpy as jnp
+from absl import app, flags
+from mujoco import mjx
+
+import milx
+from milx.envs.base import State
+from milx.envs.push.env import Push
+from milx.trajopt import sampling
+from milx.trajopt.expert import problem_of
+from milx.trajopt.sampling import Options
+
+sys.path.insert(0, str(pathlib.Path(__file__).parents[1] / "planning"))
+from planner import KNOTS, Planner, draw, make_cheap_env, make_env
+
+_OUT = flags.DEFINE_string("out", str(common.RESULTS), "Folder of the JSON file.")
+_SAMPLES = flags.DEFINE_integer("samples", 2048, "Candidates of an iteration.", lower_bound=16)
+_ITERATIONS = flags.DEFINE_integer("iterations", 20, "Iterations of a search.", lower_bound=1)
+_SEEDS = flags.DEFINE_integer("seeds", 5, "Searches; their median is shown.", lower_bound=1)
+_REPEATS = flags.DEFINE_integer("repeats", 10, "Timed iterations, after one to warm up.", lower_bound=1)
+STEP = 0.05
+"""Length of a time step (s)."""
+DEVIATION, DEVIATION_MIN = 0.3, 0.03
+"""Of the first candidates in torques, in units of their limits, and the least one of all; velocities begin with the
+planner's own."""
+CANDIDATES_PER_ELITE = 8
+
+
+class Peer(NamedTuple):
+    """A way to search.
+
+    Attributes:
+        begin: a seed -> what its search begins with.
+        iterate: what the search has, key -> what it has after an iteration; jitted.
+        cost: what the search has -> the cost of its mean in the environment.
+    """
+
+    begin: Callable[[int], Any]
+    iterate: Callable[[Any, jax.Array], Any]
+    cost: Callable[[Any], jax.Array]
+
+
+class Scene:
+    """A scene of push, drawn like those of demonstrate.py.
+
+    Args:
+        samples: candidates of an iteration.
+    """
+
+    def __init__(self, samples: int):
+        self.env, self.samples, self.elites = make_env(), samples, samples // CANDIDATES_PER_ELITE
+        self.tasks, self.starts, _ = draw(self.env, 1, 0)
+        self.task, self.start = jax.tree.map(lambda x: x[0], (self.tasks, self.starts))
+        self.options = Options("cross_entropy", samples, order=1, elites=self.elites, deviation_min=DEVIATION_MIN)
+        self._problem = problem_of(self.env, self.task, self.start)
+
+    def cost_of_torques(self, knots: jax.Array) -> jax.Array:
+        """Computes the cost of a plan in torques [KNOTS, 7]."""
+        start = self.start.vector
+        return sampling.start_from(self._problem, start, knots[None], 0.0, self.env.horizon, self.options).cost
+
+    def torques(self) -> Peer:
+        """Prepares milx's search in torques."""
+
+        @jax.jit
+        def iterate(search: sampling.Search, key: jax.Array) -> sampling.Search:
+            return sampling.solve(self._problem, self.start.vector, search, self.env.horizon, key, self.options)
+
+        begin = sampling.start(jnp.zeros((KNOTS, self.env.action_size)), DEVIATION)
+        return Peer(lambda _: begin, iterate, lambda search: jax.jit(self.cost_of_torques)(search.knots))
+
+    def velocities(self, model: Push) -> Peer:
+        """Prepares milx's search in velocities of the hand."""
+        planner, judge = Planner(self.env, self.options, model), Planner(self.env, self.options)
+
+        def iterate(search: sampling.Search, key: jax.Array) -> sampling.Search:
+            return planner.improve(self.tasks, self.starts, search, key[None])
+
+        def cost(search: sampling.Search) -> jax.Array:
+            return judge.start_from(self.tasks, self.starts, search.knots[:, None]).cost[0]
+
+        return Peer(lambda _: planner.start(1), iterate, cost)
+
+    def hydrax(self) -> Peer:
+        """Prepares hydrax's search in torques.
+
+        Raises:
+            ImportError: if it is not installed.
+        """
+        from hydrax.algs import CEM
+        from hydrax.task_base import Task
+
+        env, task, start = self.env, self.task, self.start
+
+        class PushAsItIs(Task):
+            """The environment's model of the task, and its costs, which hydrax multiplies by the time step."""
+
+            def __init__(self) -> None:
+                super().__init__(env.mj_model)
+                self.model = env.model_of(task)
+
+            def running_cost(self, state: mjx.Data, control: jax.Array) -> jax.Array:
+                """Computes half the running residual's square, per second."""
+                residual = env.running_residual(task, _state(start, state), control, jnp.int32(0))
+                return 0.5 * residual @ residual / STEP
+
+            def terminal_cost(self, state: mjx.Data) -> jax.Array:
+                """Computes half the terminal residual's square."""
+                residual = env.terminal_residual(task, _state(start, state))
+                return 0.5 * residual @ residual
+
+        sizes = {"num_samples": self.samples, "num_elites": self.elites, "num_knots": KNOTS}
+        sigma = {"sigma_start": DEVIATION, "sigma_min": DEVIATION_MIN}
+        planned = PushAsItIs()
+        search = CEM(planned, **sizes, **sigma, T=env.horizon * STEP, dt=STEP, spline_type="linear")
+        optimize, first = jax.jit(search.optimize), env.data(start)
+        return Peer(
+            lambda seed: search.init_params(seed),
+            lambda params, _: optimize(first, params)[0],
+            lambda params: jax.jit(self.cost_of_torques)(params.mean),
+        )
+
+
+def _state(start: State, data: mjx.Data) -> State:
+    return start.with_vector(jnp.concatenate([data.qpos, data.qvel]))
+
+
+def main(_: list[str]) -> None:
+    """Measures all searches, one after the other."""
+    milx.configure()
+    report, scene = common.Report("planning", pathlib.Path(_OUT.value)), Scene(_SAMPLES.value)
+    found: dict[str, tuple[float, float]] = {}
+
+    def measure(peer: Peer) -> tuple[float, float]:
+        costs = []
+        for seed in range(_SEEDS.value):
+            search = peer.begin(seed)
+            for key in jax.random.split(jax.random.key(seed), _ITERATIONS.value):
+                search = peer.iterate(search, key)
+            costs.append(float(peer.cost(search)))
+        ms = common.median_ms(peer.iterate, peer.begin(0), jax.random.key(0), repeats=_REPEATS.value)
+        return statistics.median(costs), 1e3 * _SAMPLES.value / ms
+
+    for name, prepare in {
+        "torques": scene.torques,
+        "torques, hydrax": scene.hydrax,
+        "velocities of the hand": lambda: scene.velocities(scene.env),
+        "velocities of the hand, cheaper physics": lambda: scene.velocities(make_cheap_env()),
+    }.items():
+
+        def both(name: str = name, prepare: Callable[[], Peer] = prepare) -> tuple[float, None]:
+            found[name] = measure(prepare())
+            return found[name][0], None
+
+        rollouts = _ITERATIONS.value * _SAMPLES.value
+        report.attempt(f"push, {name}: cost after {rollouts} rollouts", "", both, f"median of {_SEEDS.value} searches")
+        if name in found:
+            report.add(f"push, {name}: rollouts of {_SAMPLES.value} candidates at once", found[name][1], "1/s")
+
+
+if __name__ == "__main__":
+    app.run(main)
