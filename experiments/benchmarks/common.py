@@ -10,9 +10,11 @@ from typing import Any
 
 import jax
 
+import milx
 from milx.evaluation import provenance
 
 RESULTS = pathlib.Path(__file__).parents[1] / "results" / "benchmarks"
+milx.configure()  # before the next line starts JAX
 ACCELERATED = jax.default_backend() != "cpu"
 
 

@@ -12,7 +12,6 @@ import common
 import workload
 from absl import app, flags
 
-import milx
 from milx import envs
 from milx.config.assemble import make_config
 
@@ -28,7 +27,6 @@ _SIZES = {
 
 def main(_: list[str]) -> None:
     """Measures and writes the JSON file."""
-    milx.configure()
     report = common.Report("growth", pathlib.Path(_OUT.value))
     changes = [(name, size) for name, sizes in _SIZES.items() for size in sizes[: 1 if _TINY.value else None]]
     for name, size in [("meta-batch", 5), *changes]:

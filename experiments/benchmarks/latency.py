@@ -16,7 +16,6 @@ import workload
 from absl import app, flags
 from jax.experimental.compilation_cache import compilation_cache
 
-import milx
 from milx import envs, methods
 from milx.config.assemble import make_config
 from milx.config.schema import Config
@@ -91,7 +90,6 @@ def measure_compilation(config: Config, env: Env, report: common.Report) -> None
 
 def main(_: list[str]) -> None:
     """Measures and writes the JSON file."""
-    milx.configure()
     report, env = common.Report("latency", pathlib.Path(_OUT.value)), envs.make("reach")
     fast = make_config("reach", preset="fast")
     measure_policy("reach, paper's network", make_config("reach", preset="paper"), env, report)

@@ -23,7 +23,6 @@ import push_sized
 import workload
 from absl import app, flags
 
-import milx
 from milx import envs, methods
 from milx.config.assemble import make_config
 from milx.config.schema import Config
@@ -174,7 +173,6 @@ def measure_domain(name: str) -> None:
 
 def main(_: list[str]) -> None:
     """Measures and writes the JSON files."""
-    milx.configure()
     for name in _DOMAINS.value:
         measure_domain(name)
 

@@ -19,7 +19,6 @@ import push_sized
 from absl import app, flags
 from mujoco import mjx
 
-import milx
 from milx.trajopt.linearize import linearize
 
 _OUT = flags.DEFINE_string("out", str(common.RESULTS), "Folder of the JSON file.")
@@ -93,7 +92,6 @@ def measure_jacobians(env: push_sized.PushSized, points: int, how: str) -> tuple
 
 def main(_: list[str]) -> None:
     """Measures and writes the JSON file."""
-    milx.configure()
     report, env = common.Report("physics", pathlib.Path(_OUT.value)), push_sized.PushSized()
     accelerated = common.ACCELERATED
     worlds = _WORLDS.value or (8192 if accelerated else 64)

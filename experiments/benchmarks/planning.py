@@ -22,7 +22,6 @@ import jax.numpy as jnp
 from absl import app, flags
 from mujoco import mjx
 
-import milx
 from milx.envs.base import State
 from milx.envs.push.env import Push
 from milx.trajopt import sampling
@@ -146,7 +145,6 @@ def _state(start: State, data: mjx.Data) -> State:
 
 def main(_: list[str]) -> None:
     """Measures all searches, one after the other."""
-    milx.configure()
     report, scene = common.Report("planning", pathlib.Path(_OUT.value)), Scene(_SAMPLES.value)
     found: dict[str, tuple[float, float]] = {}
 

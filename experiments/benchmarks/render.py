@@ -22,7 +22,6 @@ import push_sized
 from absl import app, flags
 from mujoco import mjx
 
-import milx
 from milx import envs
 from milx.core import platform
 from milx.envs.base import Env
@@ -112,7 +111,6 @@ def measure_milx(env: Env, count: int, draw: Callable[[Scene], jax.Array]) -> tu
 
 def main(_: list[str]) -> None:
     """Measures and writes the JSON file."""
-    milx.configure()
     report = common.Report("render", pathlib.Path(_OUT.value))
     count = _FRAMES.value or (64 if not common.ACCELERATED else 4096)
     note = f"{count} at once"

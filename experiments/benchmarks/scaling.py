@@ -14,7 +14,6 @@ import workload
 from absl import app, flags
 from jax.sharding import Mesh
 
-import milx
 from milx.core import parallel
 
 _OUT = flags.DEFINE_string("out", str(common.RESULTS), "Folder of the JSON file.")
@@ -34,7 +33,6 @@ def measure(devices: int) -> tuple[float, float]:
 
 def main(_: list[str]) -> None:
     """Measures and writes the JSON file."""
-    milx.configure()
     report = common.Report("scaling", pathlib.Path(_OUT.value))
     devices, alone = 1, None
     while devices <= jax.device_count():
