@@ -44,7 +44,7 @@ planner's own."""
 CANDIDATES_PER_ELITE = 8
 
 
-class Peer(NamedTuple):
+class Searcher(NamedTuple):
     """A way to search.
 
     Attributes:
@@ -77,7 +77,7 @@ class Scene:
         start = self.start.vector
         return sampling.start_from(self._problem, start, knots[None], 0.0, self.env.horizon, self.options).cost
 
-    def torques(self) -> Peer:
+    def torques(self) -> Searcher:
         """Prepares milx's search in torques."""
 
         @jax.jit
@@ -85,9 +85,9 @@ class Scene:
             return sampling.solve(self._problem, self.start.vector, search, self.env.horizon, key, self.options)
 
         begin = sampling.start(jnp.zeros((KNOTS, self.env.action_size)), DEVIATION)
-        return Peer(lambda _: begin, iterate, lambda search: jax.jit(self.cost_of_torques)(search.knots))
+        return Searcher(lambda _: begin, iterate, lambda search: jax.jit(self.cost_of_torques)(search.knots))
 
-    def velocities(self, model: Push) -> Peer:
+    def velocities(self, model: Push) -> Searcher:
         """Prepares milx's search in velocities of the hand."""
         planner, judge = Planner(self.env, self.options, model), Planner(self.env, self.options)
 
@@ -97,9 +97,9 @@ class Scene:
         def cost(search: sampling.Search) -> jax.Array:
             return judge.start_from(self.tasks, self.starts, search.knots[:, None]).cost[0]
 
-        return Peer(lambda _: planner.start(1), iterate, cost)
+        return Searcher(lambda _: planner.start(1), iterate, cost)
 
-    def hydrax(self) -> Peer:
+    def hydrax(self) -> Searcher:
         """Prepares hydrax's search in torques.
 
         Raises:
@@ -132,7 +132,7 @@ class Scene:
         planned = PushAsItIs()
         search = CEM(planned, **sizes, **sigma, T=env.horizon * STEP, dt=STEP, spline_type="linear")
         optimize, first = jax.jit(search.optimize), env.data(start)
-        return Peer(
+        return Searcher(
             lambda seed: search.init_params(seed),
             lambda params, _: optimize(first, params)[0],
             lambda params: jax.jit(self.cost_of_torques)(params.mean),
@@ -148,14 +148,14 @@ def main(_: list[str]) -> None:
     report, scene = common.Report("planning", pathlib.Path(_OUT.value)), Scene(_SAMPLES.value)
     found: dict[str, tuple[float, float]] = {}
 
-    def measure(peer: Peer) -> tuple[float, float]:
+    def measure(searcher: Searcher) -> tuple[float, float]:
         costs = []
         for seed in range(_SEEDS.value):
-            search = peer.begin(seed)
+            search = searcher.begin(seed)
             for key in jax.random.split(jax.random.key(seed), _ITERATIONS.value):
-                search = peer.iterate(search, key)
-            costs.append(float(peer.cost(search)))
-        ms = common.median_ms(peer.iterate, peer.begin(0), jax.random.key(0), repeats=_REPEATS.value)
+                search = searcher.iterate(search, key)
+            costs.append(float(searcher.cost(search)))
+        ms = common.median_ms(searcher.iterate, searcher.begin(0), jax.random.key(0), repeats=_REPEATS.value)
         return statistics.median(costs), 1e3 * _SAMPLES.value / ms
 
     for name, prepare in {
@@ -165,7 +165,7 @@ def main(_: list[str]) -> None:
         "velocities of the hand, cheaper physics": lambda: scene.velocities(make_cheap_env()),
     }.items():
 
-        def both(name: str = name, prepare: Callable[[], Peer] = prepare) -> tuple[float, None]:
+        def both(name: str = name, prepare: Callable[[], Searcher] = prepare) -> tuple[float, None]:
             found[name] = measure(prepare())
             return found[name][0], None
 

@@ -10,7 +10,7 @@ import sys
 import matplotlib.pyplot as plt
 from matplotlib.ticker import NullFormatter
 
-PEERS = ("PyTorch", "JAX, vmap", "MJX", "mujoco", "mapped jvp")
+PEERS = ("PyTorch", "JAX, vmap", "MJX", "mujoco", "mapped jvp", "hydrax")
 FOLDER = pathlib.Path(__file__).parents[1] / "results" / "benchmarks"
 
 
