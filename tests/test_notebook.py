@@ -27,7 +27,9 @@ def execute(cache, tmp_path_factory):
     # As conftest.py does in its own process: the options for drawing many pixels make programs compile twice as long.
     startup = tmp_path_factory.mktemp("ipython") / "profile_default" / "startup"
     startup.mkdir(parents=True)
-    (startup / "platform.py").write_text("from milx.core import platform\nplatform.pixel_options = dict\n")
+    (startup / "platform.py").write_text(
+        "from milx.core import platform\nplatform.pixel_options = dict\ndel platform\n"
+    )
 
     def run(name, steps, tasks):
         folder = tmp_path_factory.mktemp("notebook")

@@ -10,12 +10,14 @@ from typing import Any
 
 import jax
 
-import milx
 from milx.evaluation import provenance
 
 RESULTS = pathlib.Path(__file__).parents[1] / "results" / "benchmarks"
-milx.configure()  # before the next line starts JAX
-ACCELERATED = jax.default_backend() != "cpu"
+
+
+def accelerated() -> bool:
+    """Tells whether JAX has an accelerator. It starts JAX, so `milx.configure` comes before."""
+    return jax.default_backend() != "cpu"
 
 
 def median_ms(
@@ -57,8 +59,8 @@ class Report:
         print(f"{self.benchmark:10s} {name:60s} {value:>20s} {note}", flush=True)
         self.folder.mkdir(parents=True, exist_ok=True)
         content = {"benchmark": self.benchmark, **provenance.origin(), "rows": self.rows}
-        content["versions"] |= provenance.versions(("torch", "warp-lang"))
-        file = self.benchmark if ACCELERATED else f"{self.benchmark}-cpu"
+        content["versions"] |= provenance.versions(("torch", "warp-lang", "hydrax"))
+        file = self.benchmark if accelerated() else f"{self.benchmark}-cpu"
         (self.folder / f"{file}.json").write_text(json.dumps(content, indent=1) + "\n")
 
     def measure(self, name: str, unit: str, function: Callable[[], tuple[float, float | None]], note: str = "") -> None:

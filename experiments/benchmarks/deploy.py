@@ -22,6 +22,7 @@ import pyarrow
 import pyarrow.parquet
 from absl import app, flags
 
+import milx
 from milx import envs, methods
 from milx.config.assemble import make_config
 from milx.data import episodes
@@ -143,6 +144,7 @@ def measure_export(preset: str, folder: pathlib.Path, report: common.Report) -> 
 
 def main(_: list[str]) -> None:
     """Measures and writes the JSON file."""
+    milx.configure()
     report = common.Report("deploy", pathlib.Path(_OUT.value))
     with tempfile.TemporaryDirectory() as folder:
         measure_import(pathlib.Path(folder), report)

@@ -12,6 +12,7 @@ import common
 import workload
 from absl import app, flags
 
+import milx
 from milx import envs
 from milx.config.assemble import make_config
 
@@ -27,12 +28,13 @@ _SIZES = {
 
 def main(_: list[str]) -> None:
     """Measures and writes the JSON file."""
+    milx.configure()
     report = common.Report("growth", pathlib.Path(_OUT.value))
     changes = [(name, size) for name, sizes in _SIZES.items() for size in sizes[: 1 if _TINY.value else None]]
     for name, size in [("meta-batch", 5), *changes]:
         config = make_config("reach", preset="paper")
         config.train.meta_batch, config.method.imitation_steps = 5, 0
-        config.network.mixed_precision = common.ACCELERATED
+        config.network.mixed_precision = common.accelerated()
         frames = size if name == "time steps" else config.train.support_frames
         config.train.support_frames = config.train.query_frames = frames
         config.train.meta_batch = size if name == "meta-batch" else config.train.meta_batch

@@ -16,6 +16,7 @@ import workload
 from absl import app, flags
 from jax.experimental.compilation_cache import compilation_cache
 
+import milx
 from milx import envs, methods
 from milx.config.assemble import make_config
 from milx.config.schema import Config
@@ -61,7 +62,7 @@ def measure_evaluation(config: Config, env: Env, report: common.Report) -> None:
 
 def measure_planning(env: Env, report: common.Report) -> None:
     """Adds the row of demonstrations planned and performed."""
-    count = _PLANS.value or (50 if not common.ACCELERATED else 4096)
+    count = _PLANS.value or (50 if not common.accelerated() else 4096)
     keys = jax.random.split(jax.random.key(0), count)
     task = jax.vmap(env.sample_task, in_axes=(0, None))(keys, "train")
     state = jax.vmap(env.reset)(keys, task)
@@ -90,6 +91,7 @@ def measure_compilation(config: Config, env: Env, report: common.Report) -> None
 
 def main(_: list[str]) -> None:
     """Measures and writes the JSON file."""
+    milx.configure()
     report, env = common.Report("latency", pathlib.Path(_OUT.value)), envs.make("reach")
     fast = make_config("reach", preset="fast")
     measure_policy("reach, paper's network", make_config("reach", preset="paper"), env, report)

@@ -23,6 +23,7 @@ import push_sized
 import workload
 from absl import app, flags
 
+import milx
 from milx import envs, methods
 from milx.config.assemble import make_config
 from milx.config.schema import Config
@@ -135,7 +136,7 @@ def measure_domain(name: str) -> None:
     config.train.meta_batch, config.train.support_frames, config.train.query_frames = tasks, frames, frames
     batch = workload.random_batch(env, tasks, frames)
     sizes = f"{tasks} tasks x 2 x {frames} frames of {env.image_shape[1]}x{env.image_shape[0]}"
-    repeats = 20 if common.ACCELERATED else 3
+    repeats = 20 if common.accelerated() else 3
 
     def variant(mixed: bool, rematerialise: bool = False) -> Config:
         network = dataclasses.replace(config.network, mixed_precision=mixed, rematerialise=rematerialise)
@@ -145,7 +146,7 @@ def measure_domain(name: str) -> None:
         compiled, params = compile_gradient(variant(*changes), env, batch, by)
         return common.median_ms(compiled, params, batch, repeats=repeats), common.gib(compiled)
 
-    accelerated = common.ACCELERATED
+    accelerated = common.accelerated()
     for mixed in (True, False) if accelerated else (False,):
         kind = "bfloat16" if mixed else "float32"
         report.measure(f"milx, {kind}", "ms", lambda mixed=mixed: gradient(mixed), f"{sizes}, called one by one")
@@ -173,6 +174,7 @@ def measure_domain(name: str) -> None:
 
 def main(_: list[str]) -> None:
     """Measures and writes the JSON files."""
+    milx.configure()
     for name in _DOMAINS.value:
         measure_domain(name)
 

@@ -19,6 +19,7 @@ import push_sized
 from absl import app, flags
 from mujoco import mjx
 
+import milx
 from milx.trajopt.linearize import linearize
 
 _OUT = flags.DEFINE_string("out", str(common.RESULTS), "Folder of the JSON file.")
@@ -92,8 +93,9 @@ def measure_jacobians(env: push_sized.PushSized, points: int, how: str) -> tuple
 
 def main(_: list[str]) -> None:
     """Measures and writes the JSON file."""
+    milx.configure()
     report, env = common.Report("physics", pathlib.Path(_OUT.value)), push_sized.PushSized()
-    accelerated = common.ACCELERATED
+    accelerated = common.accelerated()
     worlds = _WORLDS.value or (8192 if accelerated else 64)
     points = _POINTS.value or (2048 if accelerated else 32)
     note, unit = f"{worlds} worlds, nv = {env.mj_model.nv}, {env.mj_model.npair} contact pairs, apart", "substeps/s"

@@ -1,15 +1,18 @@
 """The cross-entropy method beside hydrax: what its plans cost, and rollouts per second, in one scene of push.
 
-    pip install git+https://github.com/vincekurtz/hydrax
+    pip install git+https://github.com/vincekurtz/hydrax@02ac1c4a91a33897dc0e8f2d6f8a468a24b72018
     python experiments/benchmarks/planning.py
     python experiments/benchmarks/planning.py --samples=16 --iterations=2 --seeds=1 --repeats=1
 
 Both search torques of the seven motors, as a linear spline of ten knots for the whole episode, from zero, with the same
-physics, costs, deviations and numbers of candidates and elites. milx searches velocities of the hand besides, in the
+model, costs, deviations and numbers of candidates and elites. hydrax carries all of MJX's data from step to step, so
+that its contact solver starts from the last step's forces, and calls `mjx.forward` once more in each time step; milx
+has the mean and the last cheapest candidate among the candidates. milx searches velocities of the hand besides, in the
 environment and in a cheaper model of it (experiments/planning/planner.py). What the means of all searches cost in the
 end is computed in the environment, by one program for torques and one for velocities.
 """
 
+import functools
 import pathlib
 import statistics
 import sys
@@ -22,6 +25,7 @@ import jax.numpy as jnp
 from absl import app, flags
 from mujoco import mjx
 
+import milx
 from milx.envs.base import State
 from milx.envs.push.env import Push
 from milx.trajopt import sampling
@@ -72,6 +76,7 @@ class Scene:
         self.options = Options("cross_entropy", samples, order=1, elites=self.elites, deviation_min=DEVIATION_MIN)
         self._problem = problem_of(self.env, self.task, self.start)
 
+    @functools.partial(jax.jit, static_argnums=0)
     def cost_of_torques(self, knots: jax.Array) -> jax.Array:
         """Computes the cost of a plan in torques [KNOTS, 7]."""
         start = self.start.vector
@@ -85,7 +90,7 @@ class Scene:
             return sampling.solve(self._problem, self.start.vector, search, self.env.horizon, key, self.options)
 
         begin = sampling.start(jnp.zeros((KNOTS, self.env.action_size)), DEVIATION)
-        return Searcher(lambda _: begin, iterate, lambda search: jax.jit(self.cost_of_torques)(search.knots))
+        return Searcher(lambda _: begin, iterate, lambda search: self.cost_of_torques(search.knots))
 
     def velocities(self, model: Push) -> Searcher:
         """Prepares milx's search in velocities of the hand."""
@@ -111,7 +116,7 @@ class Scene:
         env, task, start = self.env, self.task, self.start
 
         class PushAsItIs(Task):
-            """The environment's model of the task, and its costs, which hydrax multiplies by the time step."""
+            """The environment's model of the task, and its costs; hydrax multiplies running costs by the time step."""
 
             def __init__(self) -> None:
                 super().__init__(env.mj_model)
@@ -135,7 +140,7 @@ class Scene:
         return Searcher(
             lambda seed: search.init_params(seed),
             lambda params, _: optimize(first, params)[0],
-            lambda params: jax.jit(self.cost_of_torques)(params.mean),
+            lambda params: self.cost_of_torques(params.mean),
         )
 
 
@@ -145,18 +150,21 @@ def _state(start: State, data: mjx.Data) -> State:
 
 def main(_: list[str]) -> None:
     """Measures all searches, one after the other."""
+    milx.configure()
     report, scene = common.Report("planning", pathlib.Path(_OUT.value)), Scene(_SAMPLES.value)
-    found: dict[str, tuple[float, float]] = {}
+    rollouts = _ITERATIONS.value * _SAMPLES.value
 
-    def measure(searcher: Searcher) -> tuple[float, float]:
-        costs = []
+    def measure(name: str, prepare: Callable[[], Searcher]) -> tuple[float, None]:
+        """Adds the row of the rate, and returns the median of the costs."""
+        searcher, costs = prepare(), []
         for seed in range(_SEEDS.value):
             search = searcher.begin(seed)
             for key in jax.random.split(jax.random.key(seed), _ITERATIONS.value):
                 search = searcher.iterate(search, key)
             costs.append(float(searcher.cost(search)))
         ms = common.median_ms(searcher.iterate, searcher.begin(0), jax.random.key(0), repeats=_REPEATS.value)
-        return statistics.median(costs), 1e3 * _SAMPLES.value / ms
+        report.add(f"push, {name}: rollouts of {_SAMPLES.value} candidates at once", 1e3 * _SAMPLES.value / ms, "1/s")
+        return statistics.median(costs), None
 
     for name, prepare in {
         "torques": scene.torques,
@@ -164,15 +172,9 @@ def main(_: list[str]) -> None:
         "velocities of the hand": lambda: scene.velocities(scene.env),
         "velocities of the hand, cheaper physics": lambda: scene.velocities(make_cheap_env()),
     }.items():
-
-        def both(name: str = name, prepare: Callable[[], Searcher] = prepare) -> tuple[float, None]:
-            found[name] = measure(prepare())
-            return found[name][0], None
-
-        rollouts = _ITERATIONS.value * _SAMPLES.value
-        report.attempt(f"push, {name}: cost after {rollouts} rollouts", "", both, f"median of {_SEEDS.value} searches")
-        if name in found:
-            report.add(f"push, {name}: rollouts of {_SAMPLES.value} candidates at once", found[name][1], "1/s")
+        add = report.attempt if prepare == scene.hydrax else report.measure
+        label, note = f"push, {name}: cost after {rollouts} rollouts", f"median of {_SEEDS.value} searches"
+        add(label, "", functools.partial(measure, name, prepare), note)
 
 
 if __name__ == "__main__":

@@ -22,6 +22,7 @@ import push_sized
 from absl import app, flags
 from mujoco import mjx
 
+import milx
 from milx import envs
 from milx.core import platform
 from milx.envs.base import Env
@@ -111,15 +112,16 @@ def measure_milx(env: Env, count: int, draw: Callable[[Scene], jax.Array]) -> tu
 
 def main(_: list[str]) -> None:
     """Measures and writes the JSON file."""
+    milx.configure()
     report = common.Report("render", pathlib.Path(_OUT.value))
-    count = _FRAMES.value or (64 if not common.ACCELERATED else 4096)
+    count = _FRAMES.value or (64 if not common.accelerated() else 4096)
     note = f"{count} at once"
     for env in (push_sized.PushSized(), envs.make("reach")):
         height, width = env.image_shape
         name = f"{env.name}, {env.mj_model.ngeom} geoms, {width}x{height}"
         draw = env.renderer.pixels
         report.measure(f"{name}: milx", "frames/s", lambda e=env, d=draw: measure_milx(e, count, d), note)
-        if common.ACCELERATED:
+        if common.accelerated():
             draw = lambda scene, r=env.renderer: to_uint8(r.render(scene).color)  # noqa: E731
             report.measure(f"{name}: milx, XLA", "frames/s", lambda e=env, d=draw: measure_milx(e, count, d), note)
         report.attempt(f"{name}: MJX-Warp", "frames/s", lambda e=env: measure_warp(e, count), note)

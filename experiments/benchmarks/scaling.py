@@ -14,6 +14,7 @@ import workload
 from absl import app, flags
 from jax.sharding import Mesh
 
+import milx
 from milx.core import parallel
 
 _OUT = flags.DEFINE_string("out", str(common.RESULTS), "Folder of the JSON file.")
@@ -27,12 +28,13 @@ def measure(devices: int) -> tuple[float, float]:
     parallel.mesh = lambda: mesh  # type: ignore[assignment]
     frames = _FRAMES.value
     config = push_sized.config(meta_batch=devices * _TASKS.value, support_frames=frames, query_frames=frames)
-    config.network.mixed_precision = common.ACCELERATED
+    config.network.mixed_precision = common.accelerated()
     return workload.measure_step(config, push_sized.PushSized())
 
 
 def main(_: list[str]) -> None:
     """Measures and writes the JSON file."""
+    milx.configure()
     report = common.Report("scaling", pathlib.Path(_OUT.value))
     devices, alone = 1, None
     while devices <= jax.device_count():

@@ -58,6 +58,6 @@ def measure_step(config: Config, env: Env) -> tuple[float, float]:
     )
     inputs = trainer.init(jax.random.key(0), unit_whitening(env)), random_demos(env, 64, 4), jax.random.key(1)
     inputs = jax.device_put(inputs, NamedSharding(parallel.mesh(), PartitionSpec()))
-    steps = 20 if common.ACCELERATED else 2
+    steps = 20 if common.accelerated() else 2
     compiled = Trainer.run.lower(trainer, *inputs, steps).compile(platform.pixel_options())
     return common.median_ms(compiled, *inputs, repeats=5) / steps, common.gib(compiled)

@@ -178,9 +178,8 @@ def nearest(features: jax.Array, others: np.ndarray, count: int) -> np.ndarray:
     """
     if len(others) < count:
         raise ValueError(f"count: got {count}, expected at most {len(others)}, the plans that there are")
-    squares = (others**2).sum(axis=1) - 2 * np.asarray(
-        features
-    ) @ others.T  # the features' own squares are the same in a row
+    # The features' own squares are left out: they are the same for a whole row.
+    squares = (others**2).sum(axis=1) - 2 * np.asarray(features) @ others.T
     return np.argpartition(squares, count - 1, axis=1)[:, :count]
 
 
