@@ -131,8 +131,8 @@ def execute(
         now, key = inputs
         plan_key, act_key = jax.random.split(key)
         if every < horizon:
-            again = lambda: solve(problem, x, plan, horizon, plan_key, options, now)  # noqa: E731
-            plan = lax.cond(now > 0, again, lambda: plan)._replace(deviation=search.deviation)
+            given = plan._replace(deviation=search.deviation)
+            plan = lax.cond(now > 0, lambda: solve(problem, x, given, horizon, plan_key, options, now), lambda: given)
         actions = lax.dynamic_slice_in_dim(actions_of(problem, plan.knots, horizon, options), now, every)
         (x, _), executed = lax.scan(act, (x, x), (actions, jax.random.split(act_key, every)))
         return (x, plan), executed
