@@ -38,6 +38,7 @@ EVERY = 10
 """Time steps from one plan to the next."""
 SEARCH = Options("cross_entropy", samples=32, elites=6, order=3, deviation_min=0.03, iterations=ITERATIONS)
 AGAIN = Options("predictive", samples=32, order=3)
+"""How a plan is searched for, and how what is left of it is planned again."""
 
 
 def measure(scenes: int, batch: int, plans: int) -> Iterator[dict[str, Any]]:
@@ -132,7 +133,10 @@ def main(_: list[str]) -> None:
         files.write_json(folder / "demonstrations.json", result)
         low, high = found["wilson95"]
         newest, total = found["success_by_batch"][-1], found["seconds"]["total"]
-        print(f"{newest:.1%}; {found['success']:.2%} ({low:.2%} to {high:.2%}) of {found['scenes']} in {total:.0f} s")
+        print(
+            f"{newest:.1%}; {found['success']:.2%} ({low:.2%} to {high:.2%}) of {found['scenes']} in {total:.0f} s",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

@@ -106,7 +106,7 @@ class Planner:
         search: Search,
         key: jax.Array,
         every: int,
-        again: Options | None,
+        again: Options,
         noise: jax.Array | float,
         rate: jax.Array | float,
     ) -> jax.Array:
@@ -118,8 +118,7 @@ class Planner:
             search: [scenes], their plans.
             key: [scenes], for noise and candidates.
             every: time steps after which what is left is planned again; the horizon to keep the plans.
-            again: settings of planning again, whose candidates deviate by NEAR of DEVIATION; None for the planner's
-                own.
+            again: settings of planning again, whose candidates deviate by NEAR of DEVIATION.
             noise: standard deviation on the actions, which lie in [-1, 1].
             rate: at which the hand returns to the path that the model expects of the last plan (1/s); velocities that
                 return it may exceed LIMITS.
@@ -144,7 +143,7 @@ class Planner:
                 self.env.horizon,
                 every,
                 key,
-                again or self.options,
+                again,
                 plant,
             )
             return self.env.success(task, jax.vmap(start.with_vector)(states))

@@ -55,7 +55,8 @@ class Measurement:
     def execute(self, search: Search, every: int | None = None, noise: float = 0.0, rate: float = 0.0) -> jax.Array:
         """Executes the plans; see `Planner.execute`. They are kept unless `every` is given."""
         every = every or self.planner.env.horizon
-        return self.planner.execute(self.task, self.start, search, self.keys(1000), every, None, noise, rate)
+        keys, again = self.keys(1000), self.planner.options
+        return self.planner.execute(self.task, self.start, search, keys, every, again, noise, rate)
 
     def plan(self, search: Search, iterations: int, rollouts: int) -> tuple[Search, list[dict[str, Any]]]:
         """Improves plans.
