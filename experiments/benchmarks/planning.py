@@ -40,8 +40,6 @@ _SAMPLES = flags.DEFINE_integer("samples", 2048, "Candidates of an iteration.", 
 _ITERATIONS = flags.DEFINE_integer("iterations", 20, "Iterations of a search.", lower_bound=1)
 _SEEDS = flags.DEFINE_integer("seeds", 5, "Searches; their median is shown.", lower_bound=1)
 _REPEATS = flags.DEFINE_integer("repeats", 10, "Timed iterations, after one to warm up.", lower_bound=1)
-STEP = 0.05
-"""Length of a time step (s)."""
 DEVIATION, DEVIATION_MIN = 0.3, 0.03
 """Of the first candidates in torques, in units of their limits, and the least one of all; velocities begin with the
 planner's own."""
@@ -114,6 +112,7 @@ class Scene:
         from hydrax.task_base import Task
 
         env, task, start = self.env, self.task, self.start
+        step = env.substeps * env.mj_model.opt.timestep
 
         class PushAsItIs(Task):
             """The environment's model of the task, and its costs; hydrax multiplies running costs by the time step."""
@@ -125,7 +124,7 @@ class Scene:
             def running_cost(self, state: mjx.Data, control: jax.Array) -> jax.Array:
                 """Computes half the running residual's square, per second."""
                 residual = env.running_residual(task, _state(start, state), control, jnp.int32(0))
-                return 0.5 * residual @ residual / STEP
+                return 0.5 * residual @ residual / step
 
             def terminal_cost(self, state: mjx.Data) -> jax.Array:
                 """Computes half the terminal residual's square."""
@@ -135,10 +134,10 @@ class Scene:
         sizes = {"num_samples": self.samples, "num_elites": self.elites, "num_knots": KNOTS}
         sigma = {"sigma_start": DEVIATION, "sigma_min": DEVIATION_MIN}
         planned = PushAsItIs()
-        search = CEM(planned, **sizes, **sigma, T=env.horizon * STEP, dt=STEP, spline_type="linear")
+        search = CEM(planned, **sizes, **sigma, T=env.horizon * step, dt=step, spline_type="linear")
         optimize, first = jax.jit(search.optimize), env.data(start)
         return Searcher(
-            lambda seed: search.init_params(seed),
+            search.init_params,
             lambda params, _: optimize(first, params)[0],
             lambda params: self.cost_of_torques(params.mean),
         )
