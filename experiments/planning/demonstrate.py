@@ -34,7 +34,7 @@ ITERATIONS, ROUNDS, ROUNDS_FROM_NOTHING = 4, 2, 6
 """Iterations of a round, and how many rounds a batch has that begins with plans, and the first one from nothing."""
 FIRST_SEED = 1000
 """Of the scenes; push.py and the trials by which settings were chosen have smaller ones."""
-EVERY = 10
+EVERY = 5
 """Time steps from one plan to the next."""
 SEARCH = Options("cross_entropy", samples=32, elites=6, order=3, deviation_min=0.03, iterations=ITERATIONS)
 AGAIN = Options("predictive", samples=32, order=3)
