@@ -37,8 +37,8 @@ from planner import KNOTS, Planner, draw, make_cheap_env, make_env
 
 _OUT = flags.DEFINE_string("out", str(common.RESULTS), "Folder of the JSON file.")
 _SAMPLES = flags.DEFINE_integer("samples", 2048, "Candidates of an iteration.", lower_bound=16)
-_ITERATIONS = flags.DEFINE_integer("iterations", 20, "Iterations of a search.", lower_bound=1)
-_SEEDS = flags.DEFINE_integer("seeds", 5, "Searches; their median is shown.", lower_bound=1)
+_ITERATIONS = flags.DEFINE_integer("iterations", 10, "Iterations of a search.", lower_bound=1)
+_SEEDS = flags.DEFINE_integer("seeds", 3, "Searches; their median is shown.", lower_bound=1)
 _REPEATS = flags.DEFINE_integer("repeats", 10, "Timed iterations, after one to warm up.", lower_bound=1)
 DEVIATION, DEVIATION_MIN = 0.3, 0.03
 """Of the first candidates in torques, in units of their limits, and the least one of all; velocities begin with the
