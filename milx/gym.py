@@ -22,10 +22,10 @@ from gymnasium import spaces
 from milx import envs
 from milx.config.assemble import make_config
 from milx.config.schema import DataConfig
+from milx.data.experts import expert_of
 from milx.data.simulated import render_demo
 from milx.envs.base import State
 from milx.trajopt.expert import perform
-from milx.trajopt.ilqr import Options
 from milx.types import SPLITS, Demo
 
 
@@ -110,7 +110,7 @@ class GymEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         config = config or make_config(self.env.name, preset="fast").data
         scene = self._reset(self._key(), self._task)
         task, state, key = jax.tree.map(lambda x: x[None], (self._task, scene, self._key()))
-        planned = perform(self.env, task, state, key, Options(iterations=config.plan_iterations), config.noise)
+        planned = perform(self.env, task, state, key, expert_of(self.env, config), config.noise)
         states, action = jax.tree.map(lambda x: x[0], planned)
         return jax.tree.map(np.asarray, jax.jit(render_demo, static_argnums=0)(self.env, self._task, states, action))
 

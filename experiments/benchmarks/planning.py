@@ -8,14 +8,13 @@ Both search torques of the seven motors, as a linear spline of ten knots for the
 model, costs, deviations and numbers of candidates and elites. hydrax carries all of MJX's data from step to step, so
 that its contact solver starts from the last step's forces, and calls `mjx.forward` once more in each time step; milx
 has the mean and the last cheapest candidate among the candidates. milx searches velocities of the hand besides, in the
-environment and in a cheaper model of it (experiments/planning/planner.py). What the means of all searches cost in the
-end is computed in the environment, by one program for torques and one for velocities.
+environment and in its approximation (`milx.trajopt.planner`). What the means of all searches cost in the end is
+computed in the environment, by one program for torques and one for velocities.
 """
 
 import functools
 import pathlib
 import statistics
-import sys
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -26,14 +25,12 @@ from absl import app, flags
 from mujoco import mjx
 
 import milx
+from milx import envs
 from milx.envs.base import State
-from milx.envs.push.env import Push
 from milx.trajopt import sampling
-from milx.trajopt.expert import problem_of
+from milx.trajopt.episode import problem_of, with_controls
+from milx.trajopt.ilqr import Problem
 from milx.trajopt.sampling import Options
-
-sys.path.insert(0, str(pathlib.Path(__file__).parents[1] / "planning"))
-from planner import KNOTS, Planner, draw, make_cheap_env, make_env
 
 _OUT = flags.DEFINE_string("out", str(common.RESULTS), "Folder of the JSON file.")
 _SAMPLES = flags.DEFINE_integer("samples", 2048, "Candidates of an iteration.", lower_bound=16)
@@ -43,7 +40,7 @@ _REPEATS = flags.DEFINE_integer("repeats", 10, "Timed iterations, after one to w
 DEVIATION, DEVIATION_MIN = 0.3, 0.03
 """Of the first candidates in torques, in units of their limits, and the least one of all; velocities begin with the
 planner's own."""
-CANDIDATES_PER_ELITE = 8
+CANDIDATES_PER_ELITE, KNOTS = 8, 10
 
 
 class Searcher(NamedTuple):
@@ -61,46 +58,51 @@ class Searcher(NamedTuple):
 
 
 class Scene:
-    """A scene of push, drawn like those of demonstrate.py.
+    """A scene of push.
 
     Args:
         samples: candidates of an iteration.
     """
 
     def __init__(self, samples: int):
-        self.env, self.samples, self.elites = make_env(), samples, samples // CANDIDATES_PER_ELITE
-        self.tasks, self.starts, _ = draw(self.env, 1, 0)
-        self.task, self.start = jax.tree.map(lambda x: x[0], (self.tasks, self.starts))
+        self.env, self.samples, self.elites = envs.make("push", (16, 16)), samples, samples // CANDIDATES_PER_ELITE
+        self.task = self.env.sample_task(jax.random.key(0), "train")
+        self.start = self.env.reset(jax.random.key(1), self.task)
         self.options = Options("cross_entropy", samples, order=1, elites=self.elites, deviation_min=DEVIATION_MIN)
-        self._problem = problem_of(self.env, self.task, self.start)
-
-    @functools.partial(jax.jit, static_argnums=0)
-    def cost_of_torques(self, knots: jax.Array) -> jax.Array:
-        """Computes the cost of a plan in torques [KNOTS, 7]."""
-        start = self.start.vector
-        return sampling.start_from(self._problem, start, knots[None], 0.0, self.env.horizon, self.options).cost
+        self._torques = problem_of(self.env, self.task, self.start)
+        steering, start = self.env.steering, self.start
+        self._velocities = with_controls(
+            self._torques, lambda x, u: steering.action(start.with_vector(x), u), steering.low, steering.high
+        )
+        self._cost_of_torques, self._cost_of_velocities = map(self._cost, (self._torques, self._velocities))
 
     def torques(self) -> Searcher:
         """Prepares milx's search in torques."""
+        return self._search(self._torques, self._cost_of_torques, jnp.full(self.env.action_size, DEVIATION))
 
+    def velocities(self, approximate: bool) -> Searcher:
+        """Prepares milx's search in velocities of the hand."""
+        problem = self._velocities
+        if approximate:
+            problem = problem._replace(dynamics=problem.approximation)
+        return self._search(problem, self._cost_of_velocities, self.env.steering.deviation)
+
+    def _search(self, problem: Problem, cost: Callable[[jax.Array], jax.Array], deviation: jax.Array) -> Searcher:
         @jax.jit
         def iterate(search: sampling.Search, key: jax.Array) -> sampling.Search:
-            return sampling.solve(self._problem, self.start.vector, search, self.env.horizon, key, self.options)
+            return sampling.solve(problem, self.start.vector, search, self.env.horizon, key, self.options)
 
-        begin = sampling.start(jnp.zeros((KNOTS, self.env.action_size)), DEVIATION)
-        return Searcher(lambda _: begin, iterate, lambda search: self.cost_of_torques(search.knots))
+        begin = sampling.start(jnp.zeros((KNOTS, len(deviation))), deviation)
+        return Searcher(lambda _: begin, iterate, lambda search: cost(search.knots))
 
-    def velocities(self, model: Push) -> Searcher:
-        """Prepares milx's search in velocities of the hand."""
-        planner, judge = Planner(self.env, self.options, model), Planner(self.env, self.options)
+    def _cost(self, problem: Problem) -> Callable[[jax.Array], jax.Array]:
+        """Makes a program that computes the cost of a plan [KNOTS, k]."""
 
-        def iterate(search: sampling.Search, key: jax.Array) -> sampling.Search:
-            return planner.improve(self.tasks, self.starts, search, key[None])
+        def cost(knots: jax.Array) -> jax.Array:
+            start, horizon = self.start.vector, self.env.horizon
+            return sampling.start_from(problem, start, knots[None], 0.0, horizon, self.options).cost
 
-        def cost(search: sampling.Search) -> jax.Array:
-            return judge.start_from(self.tasks, self.starts, search.knots[:, None]).cost[0]
-
-        return Searcher(lambda _: planner.start(1), iterate, cost)
+        return jax.jit(cost)
 
     def hydrax(self) -> Searcher:
         """Prepares hydrax's search in torques.
@@ -139,7 +141,7 @@ class Scene:
         return Searcher(
             search.init_params,
             lambda params, _: optimize(first, params)[0],
-            lambda params: self.cost_of_torques(params.mean),
+            lambda params: self._cost_of_torques(params.mean),
         )
 
 
@@ -168,8 +170,8 @@ def main(_: list[str]) -> None:
     for name, prepare in {
         "torques": scene.torques,
         "torques, hydrax": scene.hydrax,
-        "velocities of the hand": lambda: scene.velocities(scene.env),
-        "velocities of the hand, cheaper physics": lambda: scene.velocities(make_cheap_env()),
+        "velocities of the hand": lambda: scene.velocities(approximate=False),
+        "velocities of the hand, cheaper physics": lambda: scene.velocities(approximate=True),
     }.items():
         add = report.attempt if prepare == scene.hydrax else report.measure
         label, note = f"push, {name}: cost after {rollouts} rollouts", f"median of {_SEEDS.value} searches"

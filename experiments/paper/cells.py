@@ -26,6 +26,7 @@ from milx.config.schema import Config
 from milx.core import files, pytrees, signals
 from milx.core.checkpoint import Checkpoints
 from milx.data import simulated as demos_lib
+from milx.data.experts import description
 from milx.data.simulated import DemoSet
 from milx.evaluation import closed_loop, listening, provenance, results
 from milx.training import loop
@@ -155,7 +156,7 @@ class Cells:
         env, method, evaluation = self._env(config), self._trainer(config).method, config.evaluation
         train, test = self._first_tasks(config), self._demos(config, "test")
         baselines = self._once(
-            ("baselines", env),
+            ("baselines", env, *description(config.data)),
             lambda: closed_loop.evaluate_baselines(env, test, evaluation, config.data, trial_key("test")),
         )
         clock.append(time.perf_counter())
@@ -294,7 +295,8 @@ class Cells:
         whole = dataclasses.replace(config, data=dataclasses.replace(config.data, tasks=self.capacity))
         env = self._env(config)
         which = config.seed if split == "train" else config.evaluation.shots
-        return self._once(("demos", env, split, which), lambda: demos_of_split(env, whole, split))
+        key = "demos", env, split, which, *description(config.data)
+        return self._once(key, lambda: demos_of_split(env, whole, split))
 
     def _once(self, key: Any, make: Callable[[], Any]) -> Any:
         if key not in self._made:

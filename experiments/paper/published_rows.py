@@ -218,12 +218,24 @@ _RELATIVES = {env: _RESULTS[env] for env in ("reach", "push")} | {
     )
 }
 
+_SAMPLING = {
+    "data.expert": "sampling",
+    "data.plan_iterations": 8,
+    "data.plan_batch": 512,
+    "evaluation.baseline_trials": 1,
+}
+_LADDER = _ladder()
+_EXPERTS = {
+    "push-sampling": Row("push: `fast`, demonstrations by sampling", "push", _LADDER["push-fast"].changes | _SAMPLING)
+}
+
 TABLES: dict[str, dict[str, Row]] = {
     "results": _RESULTS,
     "plateau": {name: Row(label, "reach", _SHORT | changes) for name, (label, changes) in _PLATEAU.items()},
     "small": {name: Row(label, "reach", _SMALL_PIXELS | changes) for name, (label, changes) in _SMALL.items()},
     "baselines": _BASELINES,
-    "ladder": _ladder(),
+    "ladder": _LADDER,
     "relatives": _RELATIVES,
+    "experts": _EXPERTS,
 }
 """The rows of every table, by name; a row that is one of the results, too, is trained there."""

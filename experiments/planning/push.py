@@ -3,12 +3,13 @@
     python experiments/planning/push.py                    # on a GPU; what has its file is not run again
     python experiments/planning/push.py --rows=cem-32 --scenes=4 --iterations=2 --more=2
 
-The planner samples velocities of the hand, which an operational-space law turns into torques. It plans whole episodes
-for an arm without noise: in the first scenes from nothing, in other scenes from the cheapest of a few plans that are
-drawn among those that succeeded in the first. Then it executes these under the presets' noise on the actions, in four
-ways: as they are, tracking the path of the hand without noise, planning the rest again every EVERY time steps, or both.
+The planner (`milx.trajopt.planner`) samples velocities of the hand, which an operational-space law turns into torques.
+It plans whole episodes for an arm without noise: in the first scenes from nothing, in other scenes from the cheapest of
+the plans of the nearest of the first. Then it executes these under the presets' noise on the actions, in four ways: as
+they are, tracking the path of the hand that the plan expects, planning the rest again every few time steps, or both.
 """
 
+import dataclasses
 import functools
 import pathlib
 import time
@@ -17,20 +18,18 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from absl import app, flags
-from planner import DEVIATION, KNOTS, NEAR, TRACKING, Planner, draw, make_env
 
 import milx
+from milx import envs
 from milx.core import files
+from milx.envs.base import Env, State, Task
 from milx.evaluation import provenance
 from milx.evaluation.intervals import wilson_interval
+from milx.trajopt.planner import Planner, Plans, Settings
 from milx.trajopt.sampling import Options, Search
 
-PLANS = 64
-"""Plans that a scene tries, drawn with replacement."""
 NOISE = 0.1
 """Standard deviation on the actions; the presets'."""
-EVERY = 20
-"""Time steps from one plan to the next, where it plans again."""
 _CEM = functools.partial(Options, "cross_entropy", deviation_min=0.03)
 ROWS = {
     "cem-32": _CEM(samples=32, elites=6, order=3),
@@ -42,21 +41,54 @@ ROWS = {
 
 
 class Measurement:
-    """Measures a planner in some scenes, which `seed` draws."""
+    """Measures a planner in some scenes, which `seed` draws, each of another training task."""
 
-    def __init__(self, planner: Planner, scenes: int, seed: int):
-        self.planner, self.scenes = planner, scenes
-        self.task, self.start, self._key = draw(planner.env, scenes, seed)
+    def __init__(self, env: Env, options: Options, scenes: int, seed: int):
+        self.env, self.scenes = env, scenes
+        self.settings = Settings(search=options, again=dataclasses.replace(options, iterations=1))
+        self.planner = Planner(env, self.settings)
+        task_key, scene_key, self._key = jax.random.split(jax.random.key(seed), 3)
+        self.task = jax.vmap(env.sample_task, in_axes=(0, None))(jax.random.split(task_key, scenes), "train")
+        self.start = jax.vmap(env.reset)(jax.random.split(scene_key, scenes), self.task)
 
     def keys(self, number: int) -> jax.Array:
         """Returns a key for each scene."""
         return jax.random.split(jax.random.fold_in(self._key, number), self.scenes)
 
-    def execute(self, search: Search, every: int | None = None, noise: float = 0.0, rate: float = 0.0) -> jax.Array:
-        """Executes the plans; see `Planner.execute`. They are kept unless `every` is given."""
-        every = every or self.planner.env.horizon
-        keys, again = self.keys(1000), self.planner.options
-        return self.planner.execute(self.task, self.start, search, keys, every, again, noise, rate)
+    def execute(self, search: Search, again: bool = False, noise: float = 0.0, tracking: bool = False) -> jax.Array:
+        """Executes the plans, and tells in which scenes that succeeds."""
+        return self._execute(search, self.keys(1000), again, noise, tracking)
+
+    @functools.partial(jax.jit, static_argnums=(0, 3, 5))
+    def _execute(self, search: Search, keys: jax.Array, again: bool, noise: float, tracking: bool) -> jax.Array:
+        every = self.settings.every if again else self.env.horizon
+        planner = Planner(self.env, dataclasses.replace(self.settings, every=every))
+
+        def one(task: Task, start: State, search: Search, key: jax.Array) -> jax.Array:
+            states, _ = planner.execute(task, start, search, key, noise, tracking)
+            return self.env.success(task, states)
+
+        return jax.vmap(one)(self.task, self.start, search, keys)
+
+    def begin(self) -> Search:
+        """Begins without plans."""
+        return jax.vmap(self.planner.begin, axis_size=self.scenes)()
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def begin_from(self, plans: Plans) -> Search:
+        """Begins with the plans of the nearest scenes."""
+        return jax.vmap(self.planner.begin_from, in_axes=(0, 0, None))(self.task, self.start, plans)
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def features(self) -> jax.Array:
+        """Describes the scenes."""
+        return jax.vmap(self.planner.features)(self.task, self.start)
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def improve(self, search: Search, keys: jax.Array) -> Search:
+        """Does one iteration."""
+        one = lambda *of_scene: self.planner.improve(*of_scene, 1)  # noqa: E731
+        return jax.vmap(one)(self.task, self.start, search, keys)
 
     def plan(self, search: Search, iterations: int, rollouts: int) -> tuple[Search, list[dict[str, Any]]]:
         """Improves plans.
@@ -73,8 +105,8 @@ class Measurement:
         curve = [self._point(search, rollouts, 0.0)]
         for number in range(iterations):
             began = time.perf_counter()
-            search = jax.block_until_ready(self.planner.improve(self.task, self.start, search, self.keys(number)))
-            rollouts += self.planner.options.samples
+            search = jax.block_until_ready(self.improve(search, self.keys(number)))
+            rollouts += self.settings.search.samples
             curve.append(self._point(search, rollouts, time.perf_counter() - began))
         return search, curve
 
@@ -88,11 +120,9 @@ class Measurement:
         """Executes plans under noise in four ways."""
         ways = {
             "open loop": lambda: self.execute(search, noise=NOISE),
-            "tracking": lambda: self.execute(search, noise=NOISE, rate=TRACKING),
-            f"planning the rest again every {EVERY} steps": lambda: self.execute(search, EVERY, NOISE),
-            f"tracking, and planning the rest again every {EVERY} steps": lambda: self.execute(
-                search, EVERY, NOISE, TRACKING
-            ),
+            "tracking": lambda: self.execute(search, False, NOISE, True),
+            "planning the rest again": lambda: self.execute(search, True, NOISE),
+            "tracking, and planning the rest again": lambda: self.execute(search, True, NOISE, True),
         }
         found = {}
         for way, execute in ways.items():
@@ -103,32 +133,23 @@ class Measurement:
 
 
 def measure(options: Options, scenes: int, iterations: int, more: int) -> dict[str, Any]:
-    """Measures a planner: from nothing in the first scenes, from their plans in as many others, and under noise there.
-
-    Raises:
-        RuntimeError: if no plan succeeds in the first scenes.
-    """
-    planner = Planner(make_env(), options)
-    first = Measurement(planner, scenes, 0)
-    search, from_nothing = first.plan(planner.start(scenes), iterations, 0)
-    good = search.knots[first.execute(search)]
-    if not len(good):
-        raise RuntimeError(f"no plan of {scenes} scenes succeeded after {iterations} iterations")
-    second = Measurement(planner, scenes, 1)
-    plans = jax.random.choice(jax.random.key(2), good, (scenes, PLANS))
+    """Measures a planner from nothing in the first scenes, and from their plans and under noise in as many others."""
+    env = envs.make("push", (16, 16))
+    first, second = (Measurement(env, options, scenes, seed) for seed in (0, 1))
+    search, from_nothing = first.plan(first.begin(), iterations, 0)
+    plans = Plans(first.features(), search.knots, first.execute(search))
     began = time.perf_counter()
-    search = jax.block_until_ready(planner.start_from(second.task, second.start, plans))
+    search = jax.block_until_ready(second.begin_from(plans))
     seconds = time.perf_counter() - began
-    search, from_plans = second.plan(search, more, PLANS)
+    search, from_plans = second.plan(search, more, min(first.settings.tried, scenes))
     from_plans[0]["seconds"] = seconds
     return {
         "scenes": scenes,
         "from_nothing": from_nothing,
-        "plans_that_succeeded": len(good),
+        "plans_that_succeeded": int(plans.success.sum()),
         "from_plans": from_plans,
-        "settings": {"knots": KNOTS, "deviation": DEVIATION, "plans": PLANS, "near": NEAR},
+        "settings": dataclasses.asdict(first.settings),
         "noise": NOISE,
-        "tracking": TRACKING,
         "under_noise": second.under_noise(search),
     }
 

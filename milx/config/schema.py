@@ -47,8 +47,10 @@ class DataConfig:
         demos_per_task: demonstrations of each training task, in different scenes.
         noise: standard deviation of the Gaussian noise on the expert's actions, in units of the action.
         spare_demos: additional demonstrations of each validation and test task, so that failed ones can be replaced.
-        plan_iterations: maximum number of iterations of trajectory optimization for a demonstration; 0 to use the
-            environment's controller instead.
+        expert: how demonstrations are planned: "ilqr", or "sampling", which needs no derivatives and no controller
+            (`milx.trajopt.planner`).
+        plan_iterations: maximum number of iterations of trajectory optimization for a demonstration; with "ilqr", 0 to
+            use the environment's controller instead.
         plan_batch: demonstrations planned at once.
     """
 
@@ -56,6 +58,7 @@ class DataConfig:
     demos_per_task: int = 10
     noise: float = number(0.01, 0)
     spare_demos: int = number(0, 0, 1000)
+    expert: str = "ilqr"
     plan_iterations: int = number(16, 0, 10_000)
     plan_batch: int = 4096
 

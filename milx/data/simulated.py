@@ -18,12 +18,12 @@ from milx.config.schema import DataConfig, TrainConfig
 from milx.core import files, pytrees
 from milx.core.batching import map_in_chunks
 from milx.core.messages import warn
+from milx.data.experts import description, expert_of
 from milx.data.frames import frame_indices
 from milx.data.goals import goals
 from milx.envs.base import Env, State, Task
 from milx.trajopt import expert
 from milx.trajopt.expert import choose_tactics, judge, perform
-from milx.trajopt.ilqr import Options
 from milx.types import SPLITS, Demo, TaskBatch
 
 
@@ -77,8 +77,8 @@ def collect(
             with the next; None for no files.
     """
     tasks, each, state, keys = _draw(env, jax.random.fold_in(key, SPLITS.index(split)), split, num_tasks, num_demos)
-    options, numbers = Options(iterations=config.plan_iterations), itertools.count()
-    tactic = None if options.iterations else choose_tactics(env, each, state, config.plan_batch)
+    options, numbers = expert_of(env, config), itertools.count()
+    tactic = None if config.plan_iterations else choose_tactics(env, each, state, config.plan_batch)
 
     def plan_part(task: Task, state: State, key: jax.Array, tactic: Any) -> tuple[State, jax.Array]:
         make = functools.partial(perform, env, task, state, key, options, config.noise, tactic)
@@ -245,7 +245,7 @@ def cached(
     The hash covers the arguments, the kind of device, and the versions of JAX, MuJoCo, the environment and the experts.
     How many demonstrations are planned at once is left out: it changes no more than rounding.
     """
-    request = [env.name, seed, split, num_tasks, num_demos, config.noise, config.plan_iterations, env.action_cost]
+    request = [env.name, seed, split, num_tasks, num_demos, *description(config), env.action_cost]
     request += [jax.default_backend(), jax.__version__, mujoco.__version__, env.version, expert.VERSION]
     digest = hashlib.sha256(json.dumps(request).encode()).hexdigest()[:16]
     path = folder / f"{env.name}-{split}-{digest}.npz"

@@ -18,6 +18,7 @@ import numpy as np
 from milx.core import platform
 from milx.core.mjx import mjx
 from milx.envs.kinematics import kinematics
+from milx.envs.steering import Steering
 from milx.render.scene import Renderer
 from milx.render.textures import Textures
 from milx.types import SPLITS, Observation, Spec
@@ -219,6 +220,13 @@ class Env(abc.ABC, Generic[TaskT]):
         """
         raise ValueError(f"data.plan_iterations: got 0, expected at least 1: {self.name} has no controller")
 
+    @property
+    def steering(self) -> Steering:
+        """What the planner by sampling chooses: the actions, which do not return to a path, unless overridden."""
+        low, high = self.action_range
+        controls = lambda state, u: u  # noqa: E731
+        return Steering(low, high, 0.15 * (high - low), controls, lambda state, expected: jnp.zeros_like(low))
+
     def guess(self, task: TaskT, state: State) -> jax.Array:
         """Returns actions [T, A] with which the planner begins; zero unless overridden."""
         return jnp.zeros((self.horizon, self.action_size))
@@ -235,16 +243,23 @@ class Env(abc.ABC, Generic[TaskT]):
     @functools.partial(jax.jit, static_argnums=0)  # so that MJX, slow to trace, is traced once for all callers
     def step(self, task: TaskT, state: State, action: jax.Array) -> State:
         """Applies `action` [A], clipped to `action_range`, for `substeps` physics steps."""
-        ctrl, model = jnp.clip(action, *self.action_range), self.model_of(task)
+        return self._advance(self.model_of(task), state, action, self.substeps)
+
+    def _advance(self, model: mjx.Model, state: State, action: jax.Array, substeps: int) -> State:
+        """Applies `action` [A], clipped to `action_range`, for some physics steps of the model."""
+        ctrl = jnp.clip(action, *self.action_range)
 
         # Only positions and velocities are carried: MJX's data is large, and the rest follows from them.
         x, _ = jax.lax.scan(
-            lambda x, _: (self.integrate(model, state.with_vector(x), ctrl), None), state.vector, length=self.substeps
+            lambda x, _: (self.integrate(model, state.with_vector(x), ctrl), None), state.vector, length=substeps
         )
         return state.with_vector(x)
 
     def approximate_step(self, task: TaskT, state: State, action: jax.Array) -> State:
-        """Approximates `step` for the planner, which differentiates it; the same as `step` unless overridden."""
+        """Approximates `step` for planners: iLQR differentiates it, and sampling rolls candidates out by it.
+
+        The same as `step` unless overridden.
+        """
         return self.step(task, state, action)
 
     def integrate(self, model: mjx.Model, state: State, ctrl: jax.Array) -> jax.Array:

@@ -15,6 +15,7 @@ import numpy as np
 from milx.config.schema import Config, DataConfig, EvalConfig
 from milx.core import parallel, platform
 from milx.core.batching import map_in_chunks, map_in_groups
+from milx.data.experts import expert_of
 from milx.data.simulated import DemoSet, render_demo, shapes
 from milx.envs.base import Env, State, Task
 from milx.evaluation import listening
@@ -23,7 +24,6 @@ from milx.evaluation.rollout import rollout
 from milx.methods.base import Method
 from milx.methods.random import Random
 from milx.trajopt.expert import choose_tactics, judge, perform
-from milx.trajopt.ilqr import Options
 from milx.types import Demo, Params, TaskParams
 
 _LISTENERS = 24
@@ -230,8 +230,8 @@ def evaluate_baselines(env: Env, demos: DemoSet, config: EvalConfig, expert: Dat
     num_trials = min(config.baseline_trials, config.trials)
     total = demos.num_tasks * num_trials  # said, as arrays without entries do not tell
     tasks, scenes, keys, as_it_is = _expert_inputs(env, demos.task, key, config.trials, num_trials)
-    options = Options(iterations=expert.plan_iterations)
-    tactic = None if options.iterations else choose_tactics(env, tasks, scenes, expert.plan_batch)
+    options = expert_of(env, expert)
+    tactic = None if expert.plan_iterations else choose_tactics(env, tasks, scenes, expert.plan_batch)
 
     def plan(task: Task, state: State, key: jax.Array, tactic: Any) -> tuple[State, jax.Array]:
         return perform(env, task, state, key, options, 0.0, tactic)

@@ -2,12 +2,13 @@
 
 The noise drives the arm off the plan and the recorded action is the feedback's answer, before the noise: a
 demonstration so shows how to recover, and its labels are clean (DART, Laskey et al. 2017). Where iLQR does not plan
-(no iterations) the feedback is the environment's controller, with a tactic that a rehearsal without noise chooses.
+(no iterations) the feedback is the environment's controller, with a tactic that a rehearsal without noise chooses. An
+expert by sampling (`planner.py`) does the same with its own plans and its own way to follow them.
 """
 
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,29 +17,31 @@ import numpy as np
 from milx.core import parallel
 from milx.core.batching import map_in_chunks
 from milx.envs.base import Env, State, Task
-from milx.trajopt.ilqr import Options, Plan, Problem, solve
+from milx.trajopt import planner
+from milx.trajopt.episode import problem_of
+from milx.trajopt.ilqr import Options, Plan, solve
+from milx.trajopt.planner import Plans, Settings
 
 VERSION = 1
 """Of all that plans and demonstrates: raised when it does so differently, so that no demonstration planned before it is
 taken for one planned after it."""
 
 
-def problem_of(env: Env, task: Task, state: State) -> Problem:
-    """States the problem of an episode from `state`: the environment's dynamics, costs and limits."""
-    low, high = env.action_range
-    return Problem(
-        dynamics=lambda x, u: env.step(task, state.with_vector(x), u).vector,
-        running_residual=lambda x, u, t: env.running_residual(task, state.with_vector(x), u, t),
-        terminal_residual=lambda x: env.terminal_residual(task, state.with_vector(x)),
-        control_low=low,
-        control_high=high,
-        approximation=lambda x, u: env.approximate_step(task, state.with_vector(x), u).vector,
-    )
-
-
 def plan(env: Env, task: Task, state: State, options: Options) -> Plan:
     """Plans one episode from `state`: iLQR on the environment's costs, started from the environment's guess."""
     return solve(problem_of(env, task, state), state.vector, env.guess(task, state), options)
+
+
+class Sampling(NamedTuple):
+    """An expert by sampling.
+
+    Attributes:
+        settings: of the planner.
+        plans: of other scenes, with which it begins.
+    """
+
+    settings: Settings
+    plans: Plans
 
 
 Feedback = Callable[[State, jax.Array], jax.Array]
@@ -84,18 +87,20 @@ def perform(
     task: Task,
     state: State,
     key: jax.Array,
-    options: Options,
+    options: Options | Sampling,
     noise: float,
     tactic: np.ndarray | None = None,
 ) -> tuple[State, jax.Array]:
-    """Demonstrates a batch, as planned by iLQR or by the environment's controller. Not to be called inside `jax.jit`.
+    """Demonstrates a batch, as planned by iLQR or by sampling, or by the environment's controller.
+
+    Not to be called inside `jax.jit`.
 
     Args:
         env: the environment.
         task: [N] what is to be done.
         state: [N] the scenes.
         key: [N] draw the noise.
-        options: of iLQR; with no iterations the controller acts.
+        options: of iLQR, with no iterations of which the controller acts, or of the expert by sampling.
         noise: standard deviation of the noise, in units of the action.
         tactic: [N], the tactics of the controller; None for those that `choose_tactics` finds.
 
@@ -105,6 +110,8 @@ def perform(
     Raises:
         ValueError: for no iterations in an environment without a controller.
     """
+    if isinstance(options, Sampling):
+        return planner.demonstrate(env, options.settings, options.plans, noise, task, state, key)
     if options.iterations:
         return _perform_planned(env, options, noise, task, state, key)
     if tactic is None:

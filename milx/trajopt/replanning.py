@@ -89,7 +89,7 @@ def execute(
     every: int,
     key: jax.Array,
     options: Options,
-    plant: Callable[[jax.Array, jax.Array, jax.Array, jax.Array], jax.Array] | None = None,
+    plant: Callable[[jax.Array, jax.Array, jax.Array, jax.Array], tuple[jax.Array, jax.Array]] | None = None,
 ) -> tuple[jax.Array, jax.Array]:
     """Executes a plan to its end, and plans what is left again every `every` steps, from the state reached by then.
 
@@ -104,27 +104,27 @@ def execute(
         every: time steps from one plan to the next, a divisor of the horizon; the horizon itself to keep the plan.
         key: draws candidates, and what `plant` draws.
         options: settings of planning again, with the order of the given plan's spline.
-        plant: (x [n], u [m], x̂ [n], key) -> next x [n], what happens; the problem's dynamics by default. x̂ is where the
-            problem's dynamics take the last plan from the state in which it was made, so that a feedback law can return
-            to it.
+        plant: (x [n], u [m], x̂ [n], key) -> next x [n] and what was done [a], what happens; by default the problem's
+            dynamics, and u. x̂ is where the problem's dynamics take the last plan from the state in which it was made,
+            so that a feedback law can return to it.
 
     Returns:
-        States [T + 1, n] and actions [T, m].
+        States [T + 1, n] and what was done [T, a].
 
     Raises:
         ValueError: if `every` does not divide the horizon.
     """
     if not 1 <= every <= horizon or horizon % every:
         raise ValueError(f"every: got {every}, expected a divisor of horizon = {horizon}")
-    happens = plant or (lambda x, u, expected, key: problem.dynamics(x, u))
+    happens = plant or (lambda x, u, expected, key: (problem.dynamics(x, u), u))
     search = jax.tree.map(lambda x: x.astype(initial_state.dtype), search)
 
     def act(
         now: tuple[jax.Array, jax.Array], inputs: tuple[jax.Array, jax.Array]
     ) -> tuple[tuple[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]:
         (x, expected), (u, key) = now, inputs
-        after = happens(x, u, expected, key)
-        return (after, problem.dynamics(expected, u)), (after, u)
+        after, done = happens(x, u, expected, key)
+        return (after, problem.dynamics(expected, u)), (after, done)
 
     def go_on(carry: tuple[jax.Array, Search], inputs: tuple[jax.Array, jax.Array]):
         x, plan = carry
@@ -138,6 +138,6 @@ def execute(
         return (x, plan), executed
 
     times = jnp.arange(0, horizon, every, dtype=jnp.int32)
-    _, (states, actions) = lax.scan(go_on, (initial_state, search), (times, jax.random.split(key, len(times))))
+    _, (states, done) = lax.scan(go_on, (initial_state, search), (times, jax.random.split(key, len(times))))
     states = jnp.concatenate([initial_state[None], states.reshape(horizon, -1)])
-    return states, actions.reshape(horizon, -1)
+    return states, done.reshape(horizon, -1)

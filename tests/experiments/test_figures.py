@@ -101,7 +101,7 @@ def test_rows_of_the_published_method_fit_together_and_have_no_addition_unless_t
     methods.make(config, envs.make(row.env, (48, 48)).spec)
     state.check_steps(config)
     additions = config.network.goal_head, config.train.redraw, getattr(config.method, "learn_inner_lr", False)
-    assert not any(additions) or row in published_rows.TABLES["ladder"].values()
+    assert not any(additions) or row in published_rows.TABLES["ladder"].values() or "`fast`" in row.label
 
 
 @pytest.mark.parametrize("env", ["reach", "push"])
@@ -109,6 +109,16 @@ def test_the_ladder_ends_with_fast(env):
     last = [row for name, row in published_rows.TABLES["ladder"].items() if row.env == env][-1]
     config = dataclasses.replace(published_rows.configure(last, 1, seed=0), preset="fast")
     assert config == make_config(env, preset="fast", seed=0)
+
+
+def test_demonstrations_by_sampling_are_all_that_their_row_changes_of_fast():
+    row = published_rows.TABLES["experts"]["push-sampling"]
+    config = dataclasses.replace(published_rows.configure(row, 1, seed=0), preset="fast")
+    fast = make_config("push", preset="fast", seed=0)
+    evaluation = dataclasses.replace(fast.evaluation, baseline_trials=1)
+    assert config == dataclasses.replace(fast, data=config.data, evaluation=evaluation)
+    planned = {"expert": "sampling", "plan_iterations": 8, "plan_batch": 512}
+    assert config.data == dataclasses.replace(fast.data, **planned)
 
 
 @pytest.mark.parametrize("table", ["ladder", "relatives"])

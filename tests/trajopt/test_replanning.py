@@ -103,16 +103,16 @@ def test_a_feedback_law_is_told_which_state_the_last_plan_expects(every):
     problem, options = lq_problem(lq, np.inf), Options(samples=1)
 
     def plant(x, u, expected, key):
-        return problem.dynamics(2 * expected - x, u) + jump
+        return problem.dynamics(2 * expected - x, u) + jump, 3 * u
 
-    states, actions = replanning.execute(
+    states, done = replanning.execute(
         problem, jnp.asarray(lq["x_0"]), sampling.start(knots, 0.0), 9, every, jax.random.key(0), options, plant
     )
     x = expected = lq["x_0"]
     for t, u in enumerate(np.interp(np.arange(9), [0, 4, 8], knots[:, 0])[:, None]):
         if t % every == 0:
             expected = x
-        np.testing.assert_allclose(actions[t], u, atol=1e-9)
+        np.testing.assert_allclose(done[t], 3 * u, atol=1e-9)
         np.testing.assert_allclose(states[t], x, atol=1e-9)
         x = lq["A"] @ (2 * expected - x) + lq["B"] @ u + jump
         expected = lq["A"] @ expected + lq["B"] @ u
@@ -127,7 +127,7 @@ def test_what_is_left_is_planned_again_for_less_where_things_turn_out_otherwise(
     plan = sampling.solve(problem, state, sampling.start(jnp.zeros((12, 2)), 0.5), 12, jax.random.key(1), options)
 
     def plant(x, u, expected, key):
-        return problem.dynamics(x, u) + 0.3 * jax.random.normal(key, x.shape)
+        return problem.dynamics(x, u) + 0.3 * jax.random.normal(key, x.shape), u
 
     def run(every, key):
         states, actions = replanning.execute(problem, state, plan, 12, every, key, options, plant)

@@ -10,6 +10,7 @@ import numpy as np
 
 from milx.core.mjx import mjx
 from milx.envs.base import ASSETS, Env, State, check_split
+from milx.envs.steering import Steering
 
 NUM_OBJECTS = 3
 EXTENT = 0.2
@@ -26,6 +27,8 @@ VELOCITY_COST = 0.02
 _LEVER = 0.12
 """How far the fingertip moves when a joint turns, for the planner's guess (m/rad)."""
 _CANDIDATES = 64
+_UNIT, _DEVIATION = 0.1, 0.3
+"""Of the planner by sampling: a control of 1 in motor commands, and how far its first candidates deviate."""
 
 
 @jax.tree_util.register_dataclass
@@ -160,15 +163,13 @@ class Reach(Env[ReachTask]):
     def guess(self, task: ReachTask, state: State) -> jax.Array:
         """Turns both joints to the nearer of the two postures in which `off_target` is zero: [T, 2].
 
-        Each joint counts as an inertia j, the armature, driven by g u, with its damping. The regulator that minimizes
-        the integral of (l (q - q*))^2 + (a u)^2 without damping has the gains l / a and sqrt(2 j l / (a g)).
+        Each joint counts as an inertia, the armature, with its damping.
         """
         low, high = self.action_range
         model = self.mj_model
         goal = self._posture(state.qpos, self.fingertip(state.qpos) - self.off_target(task, state))
         inertia, damping, gear = model.dof_armature[:2], model.dof_damping[:2], model.actuator_gear[:, 0]
-        stiffness = _LEVER / self.action_cost
-        brake = np.sqrt(2 * inertia * stiffness / gear)
+        stiffness, brake = self._regulator
         h = self.substeps * model.opt.timestep
 
         def step(carry: tuple, _: None) -> tuple[tuple, jax.Array]:
@@ -178,6 +179,29 @@ class Reach(Env[ReachTask]):
             return (qpos + h * qvel, qvel), ctrl
 
         return jax.lax.scan(step, (state.qpos, state.qvel), length=self.horizon)[1]
+
+    @property
+    def steering(self) -> Steering:
+        """The motors' commands, in tenths; `_regulator` returns the joints to their path."""
+        low, high = self.action_range
+        stiffness, brake = self._regulator
+
+        def correction(state: State, expected: State) -> jax.Array:
+            return (stiffness * (expected.qpos - state.qpos) + brake * (expected.qvel - state.qvel)) / _UNIT
+
+        deviation = jnp.full(2, _DEVIATION)
+        return Steering(low / _UNIT, high / _UNIT, deviation, lambda state, u: _UNIT * u, correction)
+
+    @property
+    def _regulator(self) -> tuple[float, np.ndarray]:
+        """The gains of commands on angles (1/rad) and velocities (s/rad).
+
+        The regulator that minimizes the integral of (l (q - q*))^2 + (a u)^2, of an inertia j that is driven by g u
+        without damping, has the gains l / a and sqrt(2 j l / (a g)).
+        """
+        stiffness = _LEVER / self.action_cost
+        inertia, gear = self.mj_model.dof_armature[:2], self.mj_model.actuator_gear[:, 0]
+        return stiffness, np.sqrt(2 * inertia * stiffness / gear)
 
     def _posture(self, qpos: jax.Array, place: jax.Array) -> jax.Array:
         """Returns joint angles [2] (rad) that bring the fingertip to a place [2] (m), or as near as the arm reaches.

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from mujoco import mjx
 
+from milx.envs.operational_space import OperationalSpace
+from milx.trajopt.episode import with_controls
 from milx.trajopt.ilqr import Problem
-from milx.trajopt.operational_space import OperationalSpace, with_controls
 
 ARM = """
 <mujoco>

@@ -25,7 +25,7 @@ Reference:
 """
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -34,7 +34,6 @@ import numpy as np
 
 from milx.core.linear_algebra import solve_free
 from milx.core.mjx import mjx
-from milx.trajopt.ilqr import Problem
 
 _KINDS = mujoco.mjtJoint
 _product = functools.partial(jnp.matmul, precision=jax.lax.Precision.HIGHEST)  # a GPU rounds more by default
@@ -127,36 +126,6 @@ class OperationalSpace:
         """Returns [6, n], from the joints' velocities to the hand's, in the world's axes."""
         linear, angular = mjx.jac(model, data, data.site_xpos[self._site], self._body)
         return jnp.concatenate([linear, angular], axis=1)[self._dofs].T
-
-
-def with_controls(
-    problem: Problem, law: Callable[[jax.Array, jax.Array], jax.Array], low: jax.Array, high: jax.Array
-) -> Problem:
-    """States a problem in other controls.
-
-    Args:
-        problem: in the model's own actions, to whose limits what the law computes is clipped. Every function of it
-            calls the law anew.
-        law: maps the state x [n] and controls [k] to actions [m], as `OperationalSpace.command` may.
-        low: the lowest controls [k].
-        high: the highest controls [k].
-
-    Returns:
-        The problem of which controls minimize the same cost.
-    """
-
-    def acting(x: jax.Array, controls: jax.Array) -> jax.Array:
-        return jnp.clip(law(x, controls), problem.control_low, problem.control_high)
-
-    approximation = problem.approximation
-    return Problem(
-        dynamics=lambda x, u: problem.dynamics(x, acting(x, u)),
-        running_residual=lambda x, u, t: problem.running_residual(x, acting(x, u), t),
-        terminal_residual=problem.terminal_residual,
-        control_low=low,
-        control_high=high,
-        approximation=approximation and (lambda x, u: approximation(x, acting(x, u))),
-    )
 
 
 def _joints_to(model: mujoco.MjModel, body: int) -> list[int]:

@@ -1,0 +1,211 @@
+"""Demonstrations by sampling: of any environment with costs, and without a controller that knows the task.
+
+In each scene a search (`sampling.py`) begins with the cheapest of the plans of the nearest scenes in which a plan
+succeeded, is improved, and is executed: the robot returns to its path (`Env.steering`) while noise drives it off, and
+every few steps what is left is planned again (`replanning.execute`). Candidates are rolled out by
+`Env.approximate_step`, and what is executed happens by `Env.step`. Scenes are near each other when the running
+residuals of their first states are.
+
+Reference:
+    Laskey et al., "DART: noise injection for robust imitation learning", CoRL 2017 (the recorded action is the one
+    without noise).
+"""
+
+import dataclasses
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from milx.core import parallel
+from milx.envs.base import Env, State, Task
+from milx.trajopt import replanning, sampling
+from milx.trajopt.episode import problem_of, with_controls
+from milx.trajopt.ilqr import Problem
+from milx.trajopt.sampling import Options, Search
+
+SEARCH = Options("cross_entropy", samples=32, iterations=8, order=3, elites=6, deviation_min=0.03)
+AGAIN = Options("predictive", samples=32, order=3)
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """Settings of demonstrations by sampling.
+
+    Attributes:
+        scenes: M, in which plans are searched for from nothing, for other scenes to begin with.
+        from_nothing: iterations of those searches.
+        search: how a plan is improved that begins with those of other scenes.
+        again: how what is left of a plan is planned again.
+        every: number of time steps from one plan to the next. It is the largest divisor of the horizon that is at most
+            this.
+        knots: K, of a plan's spline.
+        near: deviation of candidates around a plan that is nearly right, as a fraction of the steering's.
+        tried: number of plans that a scene tries first.
+    """
+
+    scenes: int = 512
+    from_nothing: int = 24
+    search: Options = SEARCH
+    again: Options = AGAIN
+    every: int = 5
+    knots: int = 10
+    near: float = 0.3
+    tried: int = 64
+
+
+class Plans(NamedTuple):
+    """Plans of M scenes.
+
+    Attributes:
+        features: [M, R], what `Planner.features` says of the scenes.
+        knots: [M, K, k], of the controls.
+        success: [M] bool, whether their execution succeeded.
+    """
+
+    features: jax.Array
+    knots: jax.Array
+    success: jax.Array
+
+
+class Planner:
+    """Plans in one scene, and executes what it planned. All methods are pure; `jax.vmap` gives batches.
+
+    Args:
+        env: the environment.
+        settings: of the planner.
+    """
+
+    def __init__(self, env: Env, settings: Settings):
+        self.env, self.settings, self._steering = env, settings, env.steering
+
+    def problem(self, task: Task, start: State) -> Problem:
+        """States what is planned: the environment's costs, by its steering, in its approximate dynamics."""
+        steering, problem = self._steering, problem_of(self.env, task, start)
+        problem = problem._replace(dynamics=problem.approximation or problem.dynamics)
+        return with_controls(
+            problem, lambda x, u: steering.action(start.with_vector(x), u), steering.low, steering.high
+        )
+
+    def features(self, task: Task, start: State) -> jax.Array:
+        """Describes a scene by the running residual [R] of its first state, without an action."""
+        return self.env.running_residual(task, start, jnp.zeros(self.env.action_size), jnp.int32(0))
+
+    def begin(self) -> Search:
+        """Begins a search without a plan."""
+        knots = jnp.zeros((self.settings.knots, len(self._steering.low)))
+        return sampling.start(knots, self._steering.deviation)
+
+    def begin_from(self, task: Task, start: State, plans: Plans) -> Search:
+        """Begins a search with the cheapest of the plans of the nearest scenes in which a plan succeeded."""
+        squares = jnp.square(plans.features - self.features(task, start)).sum(axis=1)
+        squares = jnp.where(plans.success, squares, jnp.inf)
+        _, nearest = jax.lax.top_k(-squares, min(self.settings.tried, len(squares)))
+        options, horizon = self.settings.search, self.env.horizon
+        problem = self.problem(task, start)
+        return sampling.start_from(problem, start.vector, plans.knots[nearest], self._near, horizon, options)
+
+    def improve(self, task: Task, start: State, search: Search, key: jax.Array, iterations: int) -> Search:
+        """Goes on with a search."""
+        options = dataclasses.replace(self.settings.search, iterations=iterations)
+        return sampling.solve(self.problem(task, start), start.vector, search, self.env.horizon, key, options)
+
+    def execute(
+        self, task: Task, start: State, search: Search, key: jax.Array, noise: jax.Array | float, tracking: bool = True
+    ) -> tuple[State, jax.Array]:
+        """Executes a plan.
+
+        Args:
+            task: what is to be done.
+            start: the scene.
+            search: the plan.
+            key: draws noise and candidates.
+            noise: standard deviation of the noise on the actions, in their units.
+            tracking: whether the robot returns to its path.
+
+        Returns:
+            The states, with a leading axis T + 1, and the actions without noise [T, A].
+        """
+        env, steering, settings = self.env, self._steering, self.settings
+
+        def plant(
+            x: jax.Array, controls: jax.Array, expected: jax.Array, key: jax.Array
+        ) -> tuple[jax.Array, jax.Array]:
+            state = start.with_vector(x)
+            if tracking:
+                controls = controls + steering.correction(state, start.with_vector(expected))
+            action = jnp.clip(steering.action(state, controls), *env.action_range)
+            noisy = action + noise * jax.random.normal(key, action.shape)
+            return env.step(task, state, noisy).vector, action
+
+        every = max(steps for steps in range(1, settings.every + 1) if env.horizon % steps == 0)
+        search = search._replace(deviation=jnp.broadcast_to(self._near, search.deviation.shape))
+        problem = self.problem(task, start)
+        states, actions = replanning.execute(
+            problem, start.vector, search, env.horizon, every, key, settings.again, plant
+        )
+        return jax.vmap(start.with_vector)(states), actions
+
+    @property
+    def _near(self) -> jax.Array:
+        return self.settings.near * self._steering.deviation
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def demonstrate(
+    env: Env,
+    settings: Settings,
+    plans: Plans,
+    noise: jax.Array | float,
+    task: Task,
+    start: State,
+    key: jax.Array,
+) -> tuple[State, jax.Array]:
+    """Demonstrates a batch of N scenes, which begins with plans.
+
+    Args:
+        env: the environment.
+        settings: of the planner.
+        plans: of other scenes.
+        noise: standard deviation of the noise on the actions, in their units.
+        task: [N], what is to be done.
+        start: [N], the scenes.
+        key: [N], draw candidates and noise.
+
+    Returns:
+        The states, with leading axes [N, T + 1], and the actions without noise [N, T, A].
+    """
+
+    def one(plans: Plans, noise: jax.Array, task: Task, start: State, key: jax.Array) -> tuple[State, jax.Array]:
+        planner, (search_key, key) = Planner(env, settings), jax.random.split(key)
+        search = planner.begin_from(task, start, plans)
+        search = planner.improve(task, start, search, search_key, settings.search.iterations)
+        return planner.execute(task, start, search, key, noise)
+
+    batched = jax.vmap(one, in_axes=(None, None, 0, 0, 0))
+    return parallel.shard_tasks(batched, shared=2)(plans, jnp.asarray(noise, float), task, start, key)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def find_plans(env: Env, settings: Settings, noise: jax.Array | float, key: jax.Array) -> Plans:
+    """Searches for a plan in each of M scenes, of as many training tasks, and executes it.
+
+    Args:
+        env: the environment.
+        settings: of the planner, of which `scenes` is M.
+        noise: standard deviation of the noise on the actions, in their units.
+        key: draws all that is random.
+    """
+
+    def one(noise: jax.Array, key: jax.Array) -> Plans:
+        planner, (task_key, scene_key, search_key, key) = Planner(env, settings), jax.random.split(key, 4)
+        task = env.sample_task(task_key, "train")
+        start = env.reset(scene_key, task)
+        search = planner.improve(task, start, planner.begin(), search_key, settings.from_nothing)
+        states, _ = planner.execute(task, start, search, key, noise)
+        return Plans(planner.features(task, start), search.knots, env.success(task, states))
+
+    keys = jax.random.split(key, parallel.round_up(settings.scenes))
+    found = parallel.shard_tasks(jax.vmap(one, in_axes=(None, 0)), shared=1)(jnp.asarray(noise, float), keys)
+    return jax.tree.map(lambda x: x[: settings.scenes], found)

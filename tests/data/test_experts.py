@@ -1,0 +1,81 @@
+"""The expert that a run's settings ask for, and the plans with which one by sampling begins."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+import milx
+from milx.config.assemble import make_config
+from milx.config.schema import DataConfig
+from milx.data import experts
+from milx.data.simulated import collect
+from milx.trajopt.ilqr import Options
+from milx.trajopt.planner import Plans, Settings
+
+FEW = Settings(scenes=8)
+
+
+@pytest.fixture(scope="module")
+def env():
+    return milx.make("place", (8, 10))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"expert": "mppi"}, "data.expert: got 'mppi', expected one of ilqr, sampling"),
+        (
+            {"expert": "sampling", "plan_iterations": 0},
+            "data.plan_iterations: got 0, expected at least 1 with sampling",
+        ),
+    ],
+)
+def test_what_no_expert_understands_is_refused(env, changes, message):
+    with pytest.raises(ValueError, match=message):
+        experts.expert_of(env, dataclasses.replace(DataConfig(), **changes))
+
+
+def test_ilqr_has_the_iterations_of_the_settings(env):
+    assert experts.expert_of(env, DataConfig(plan_iterations=7)) == Options(iterations=7)
+    assert experts.description(DataConfig(noise=0.2, plan_iterations=7)) == [0.2, 7]
+
+
+def test_plans_are_found_once_and_kept(env, tmp_path, monkeypatch):
+    """A second process reads the file that the first has written; other settings have another file."""
+    rng = np.random.default_rng(0)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(
+        experts,
+        "find_plans",
+        lambda env, settings, noise, key: Plans(
+            rng.random((8, 15), "float32"), rng.random((8, settings.knots, 6), "float32"), rng.random(8) < 0.5
+        ),
+    )
+
+    def plans(settings, iterations):
+        experts._plans.cache_clear()
+        monkeypatch.setattr(experts, "SETTINGS", settings)
+        expert = experts.expert_of(env, DataConfig(expert="sampling", plan_iterations=iterations))
+        assert expert.settings.search.iterations == iterations
+        return expert.plans
+
+    first, again = plans(FEW, 3), plans(FEW, 4)
+    other = plans(dataclasses.replace(FEW, knots=5), 3)
+    for one, same in zip(first, again, strict=True):
+        np.testing.assert_array_equal(one, same)
+    assert other.knots.shape == (8, 5, 6)
+    assert len(list((tmp_path / "milx" / "plans").glob("place-*.npz"))) == 2
+    experts._plans.cache_clear()
+
+
+@pytest.mark.slow
+def test_place_is_demonstrated_by_sampling(env, monkeypatch):
+    """The preset's noise; iLQR succeeds in 99% of the demonstrations, and a random container in a third."""
+    monkeypatch.setattr(experts, "SETTINGS", FEW)
+    settings = {"expert": "sampling", "plan_iterations": 4, "plan_batch": 24}
+    config = dataclasses.replace(make_config("place", preset="fast").data, **settings)
+    demos = collect(env, jax.random.key(3), "validation", 12, 2, config)
+    assert float(demos.success.mean()) >= 0.8
+    assert experts.description(config) != experts.description(dataclasses.replace(config, expert="ilqr"))

@@ -1,0 +1,178 @@
+"""The planner by sampling on a cart, whose world is a few lines: what it begins with, executes and records."""
+
+import dataclasses
+import types
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from milx.envs.base import State
+from milx.envs.steering import Steering
+from milx.trajopt import planner, sampling
+from milx.trajopt.planner import Planner, Plans, Settings
+from milx.trajopt.sampling import Options
+
+NOISE = 0.05
+SETTINGS = Settings(
+    scenes=6,
+    from_nothing=6,
+    search=Options("cross_entropy", samples=16, iterations=3, elites=4, order=1),
+    again=Options("predictive", samples=8, order=1),
+    every=5,
+    knots=4,
+    tried=2,
+)
+
+
+class Cart:
+    """A cart on a line, driven by a force towards a place, which is the task. Its approximation is a lighter one."""
+
+    horizon, action_size = 12, 1
+    action_range = -jnp.ones(1), jnp.ones(1)
+
+    @property
+    def steering(self):
+        """In halves of the action; the cart returns to where it is expected."""
+        correction = lambda state, expected: 2 * (expected.qpos - state.qpos)  # noqa: E731
+        low, high = self.action_range
+        return Steering(2 * low, 2 * high, jnp.full(1, 0.5), lambda state, u: u / 2, correction)
+
+    def sample_task(self, key, split):
+        return jax.random.uniform(key, (1,), minval=-0.5, maxval=0.5)
+
+    def reset(self, key, task):
+        return State(0.1 * jax.random.normal(key, (1,)), jnp.zeros(1), jnp.zeros((0, 3)))
+
+    def _moved(self, state, action, mass):
+        velocity = state.qvel + 0.25 * jnp.clip(action, *self.action_range) / mass
+        return dataclasses.replace(state, qpos=state.qpos + 0.25 * velocity, qvel=velocity)
+
+    def step(self, task, state, action):
+        return self._moved(state, action, 1.0)
+
+    def approximate_step(self, task, state, action):
+        return self._moved(state, action, 0.8)
+
+    def running_residual(self, task, state, action, t):
+        return jnp.concatenate([state.qpos - task, 0.1 * action])
+
+    def terminal_residual(self, task, state):
+        return 3 * jnp.concatenate([state.qpos - task, state.qvel])
+
+    def success(self, task, states):
+        return jnp.abs(states.qpos[-1] - task)[0] < 0.1
+
+
+@pytest.fixture(scope="module")
+def cart():
+    return Cart()
+
+
+@pytest.fixture(scope="module")
+def scenes(cart):
+    """Tasks, scenes and keys of 40 episodes."""
+    keys = jax.random.split(jax.random.key(1), 40)
+    tasks = jax.vmap(cart.sample_task, in_axes=(0, None))(keys, "train")
+    return tasks, jax.vmap(cart.reset)(keys, tasks), keys
+
+
+@pytest.fixture(scope="module")
+def plans(cart):
+    return planner.find_plans(cart, SETTINGS, NOISE, jax.random.key(0))
+
+
+def cost(cart, task, start, knots):
+    """Rolls a plan out in the approximation, in a loop."""
+    controls = np.stack([np.interp(np.arange(12), np.linspace(0, 11, 4), row) for row in knots.T], axis=1)
+    total, state = 0.0, start
+    for t, u in enumerate(np.clip(controls, -2, 2)):
+        action = jnp.asarray(u / 2)
+        total += 0.5 * float(jnp.square(cart.running_residual(task, state, action, t)).sum())
+        state = cart.approximate_step(task, state, action)
+    return total + 0.5 * float(jnp.square(cart.terminal_residual(task, state)).sum())
+
+
+def test_a_search_begins_with_the_cheapest_plan_of_the_nearest_scenes_where_one_succeeded(cart, scenes):
+    rng = np.random.default_rng(0)
+    success = np.array([True, False, True, True, False, True])
+    plans = Plans(rng.normal(size=(6, 2)), rng.uniform(-1, 1, (6, 4, 1)), success)
+    begin = jax.jit(Planner(cart, SETTINGS).begin_from)
+    for task, start in zip(scenes[0][:5], jax.vmap(lambda x: x)(scenes[1]).qpos[:5], strict=True):
+        state = State(start, jnp.zeros(1), jnp.zeros((0, 3)))
+        distance = np.linalg.norm(plans.features - np.array([float((start - task)[0]), 0.0]), axis=1)
+        near = [i for i in np.argsort(distance) if success[i]][:2]
+        costs = [cost(cart, task, state, plans.knots[i]) for i in near]
+        search = begin(task, state, plans)
+        np.testing.assert_allclose(search.knots, plans.knots[near[np.argmin(costs)]], rtol=1e-6)
+        np.testing.assert_allclose(search.cost, min(costs), rtol=1e-4)
+        np.testing.assert_allclose(search.deviation, 0.3 * 0.5, rtol=1e-6)
+
+
+def test_plans_are_found_and_demonstrations_begin_with_them(cart, scenes, plans):
+    assert plans.success.all()
+    task, start, keys = scenes
+    states, _ = planner.demonstrate(cart, SETTINGS, plans, NOISE, task, start, keys)
+    assert jax.vmap(cart.success)(task, states).mean() > 0.95
+    still = jax.tree.map(lambda x: jnp.repeat(x[:, None], 13, axis=1), start)
+    assert jax.vmap(cart.success)(task, still).mean() < 0.5
+
+
+def test_what_is_executed_is_what_was_recorded_and_noise(cart, scenes, plans):
+    """Infers what drove the cart from its velocities: without noise the action, and otherwise what spreads so."""
+    task, start, keys = scenes
+    for noise in (0.0, NOISE):
+        states, actions = planner.demonstrate(cart, SETTINGS, plans, noise, task, start, keys)
+        driven = np.diff(states.qvel[..., 0], axis=1) / 0.25
+        off = (driven - actions[..., 0])[np.abs(driven) < 0.99]
+        assert off.size > 300
+        # Three standard errors of a standard deviation.
+        np.testing.assert_allclose(off.std(), noise, rtol=3 / np.sqrt(2 * off.size), atol=1e-5)
+
+
+def test_a_plan_that_is_kept_is_tracked_in_the_world(cart, scenes):
+    """No candidate is drawn, and nothing is planned again; a loop returns to the path of the approximation."""
+    task, start = scenes[0][0], jax.tree.map(lambda x: x[0], scenes[1])
+    kept = dataclasses.replace(SETTINGS, every=12)
+    knots = np.array([[1.0], [-0.5], [0.8], [-2.5]])
+    for tracking in (True, False):
+        execute = jax.jit(
+            lambda tracking=tracking: Planner(cart, kept).execute(
+                task, start, sampling.start(knots, 0.0), jax.random.key(0), 0.0, tracking
+            )
+        )
+        states, actions = execute()
+        state = expected = start
+        for t, u in enumerate(np.clip(np.interp(np.arange(12), np.linspace(0, 11, 4), knots[:, 0]), -2, 2)):
+            back = 2 * float((expected.qpos - state.qpos)[0]) if tracking else 0.0
+            action = np.clip((u + back) / 2, -1, 1)
+            np.testing.assert_allclose(actions[t, 0], action, atol=1e-5)
+            state = cart.step(task, state, jnp.array([action]))
+            expected = cart.approximate_step(task, expected, jnp.array([u / 2]))
+            np.testing.assert_allclose(states.qpos[t + 1], state.qpos, atol=1e-5)
+
+
+def test_scenes_do_not_depend_on_those_beside_them(cart, scenes, plans):
+    task, start, keys = scenes
+    few = lambda tree: jax.tree.map(lambda x: x[:8], tree)  # noqa: E731
+    states, actions = planner.demonstrate(cart, SETTINGS, plans, NOISE, task, start, keys)
+    alone, of_them = planner.demonstrate(cart, SETTINGS, plans, NOISE, few(task), few(start), keys[:8])
+    np.testing.assert_allclose(of_them, actions[:8], atol=1e-4)
+    np.testing.assert_allclose(alone.qpos, states.qpos[:8], atol=1e-4)
+
+
+def test_the_rest_is_planned_again_at_the_largest_divisor_of_the_horizon(cart, scenes, plans, monkeypatch):
+    asked = []
+    execute = planner.replanning.execute
+
+    def note(problem, state, search, horizon, every, *rest):
+        asked.append(every)
+        return execute(problem, state, search, horizon, every, *rest)
+
+    monkeypatch.setattr(planner, "replanning", types.SimpleNamespace(execute=note))
+    start = jax.tree.map(lambda x: x[0], scenes[1])
+    for every, expected in ((1, 1), (5, 4), (7, 6), (100, 12)):
+        chosen = Planner(cart, dataclasses.replace(SETTINGS, every=every))
+        jax.eval_shape(lambda chosen=chosen: chosen.execute(scenes[0][0], start, chosen.begin(), scenes[2][0], 0.0))
+        assert asked.pop() == expected
