@@ -86,6 +86,32 @@ def test_the_joints_of_reach_return_to_where_they_are_expected():
     np.testing.assert_allclose(state.qpos, expected.qpos, atol=0.02)
 
 
+def test_the_hand_of_place_returns_to_where_it_is_expected():
+    """The joints are moved away by up to 0.2 rad; half a second has three time constants of the return."""
+    env = milx.make("place", (8, 8))
+    key = jax.random.key(0)
+    task = env.sample_task(key, "train")
+    expected = env.reset(key, task)
+    off = np.random.default_rng(0).uniform(-0.2, 0.2, 7)
+    state = expected.with_vector(expected.vector.at[:7].add(off))
+
+    @jax.jit
+    def step(state):
+        action = env.steering.action(state, env.steering.correction(state, expected))
+        return env.step(task, state, action)
+
+    def away(state):
+        """The distance of the hand (m), and of the axes of its frame."""
+        (tip, axes, _), (goal, wanted, _) = env.hand(state.qpos), env.hand(expected.qpos)
+        return np.array([np.linalg.norm(tip - goal), np.linalg.norm(axes - wanted)])
+
+    before = away(state)
+    assert (before > [0.02, 0.1]).all()
+    for _ in range(5):
+        state = step(state)
+    assert (away(state) < 0.1 * before).all()
+
+
 def test_the_approximation_of_push_moves_the_arm_as_the_environment_does(push, free, monkeypatch):
     """MuJoCo moves the free arm for half a second by either settings, to within a thousandth of its way."""
     used = []

@@ -20,6 +20,7 @@ from milx.envs.place import containers, drop
 from milx.envs.place.containers import CONTAINERS
 from milx.envs.place.drop import Fall
 from milx.envs.shapes import SHAPES, primitives
+from milx.envs.steering import Steering
 from milx.render import textures
 from milx.render.textures import Textures
 
@@ -41,6 +42,8 @@ FALL_FRAMES = 10
 """Images of the fall in a film."""
 START_NOISE = 0.12
 """Joints start within this distance of _START (rad)."""
+TRACKING = 6.0
+"""Rate at which the hand returns to its path, where the planner samples (1/s)."""
 OFF_COST, TURN_COST = 5.0, 0.5
 """Weights of the residuals: 1/m, and of unit vectors, which have no unit."""
 _START = (0.0, -1.167, 0.0, 1.926, 0.0, 0.811, 0.0)
@@ -164,6 +167,17 @@ class Place(Env[PlaceTask]):
     def hand(self, qpos: jax.Array) -> Pose:
         """Returns the pose of the hand's tip at joints [7]."""
         return self._arm.pose(qpos)
+
+    @property
+    def steering(self) -> Steering:
+        """The actions; the hand returns to where it is expected, and to how it is turned there."""
+
+        def correction(state: State, expected: State) -> jax.Array:
+            (tip, axes, _), (goal, wanted, _) = self.hand(state.qpos), self.hand(expected.qpos)
+            turn = 0.5 * jnp.cross(axes.T, wanted.T).sum(axis=0)
+            return TRACKING * jnp.concatenate([(goal - tip) / MAX_SPEED, turn / MAX_TURN])
+
+        return dataclasses.replace(super().steering, correction=correction)
 
     def integrate(self, model: mjx.Model, state: State, ctrl: jax.Array) -> jax.Array:
         """Moves the joints for one time step so that the hand moves as `ctrl` asks."""
