@@ -76,7 +76,7 @@ def main(_: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    _ENVS = flags.DEFINE_multi_enum("envs", list(envs.ENVS), ["push"], "Which environments (repeat the flag).")
+    _ENVS = flags.DEFINE_multi_enum("envs", ["push"], list(envs.ENVS), "Which environments (repeat the flag).")
     _SCENES = flags.DEFINE_integer("scenes", 9216, "Scenes, each of another task.", lower_bound=1)
     _BATCH = flags.DEFINE_integer("batch", 512, "Scenes at once.", lower_bound=1)
     _OUT = flags.DEFINE_string("out", "experiments/results/planning", "Folder of the JSON files.")
