@@ -106,6 +106,9 @@ class GymEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
 
         Returns:
             A demonstration [T, ...] of NumPy arrays.
+
+        Raises:
+            ValueError: for an expert that does not exist.
         """
         config = config or make_config(self.env.name, preset="fast").data
         scene = self._reset(self._key(), self._task)

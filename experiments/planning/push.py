@@ -11,6 +11,7 @@ they are, tracking the path of the hand that the plan expects, planning the rest
 
 import dataclasses
 import functools
+import math
 import pathlib
 import time
 from typing import Any
@@ -112,7 +113,8 @@ class Measurement:
 
     def _point(self, search: Search, rollouts: int, seconds: float) -> dict[str, Any]:
         found = {"rollouts": rollouts, "success": float(self.execute(search).mean()), "seconds": seconds}
-        found["cheapest_cost"] = float(jnp.median(search.cost))
+        cost = float(jnp.median(search.cost))
+        found["cheapest_cost"] = cost if math.isfinite(cost) else None
         print(found, flush=True)
         return found
 

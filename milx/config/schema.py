@@ -49,9 +49,9 @@ class DataConfig:
         spare_demos: additional demonstrations of each validation and test task, so that failed ones can be replaced.
         expert: how demonstrations are planned: "ilqr", or "sampling", which needs no derivatives and no controller
             (`milx.trajopt.planner`).
-        plan_iterations: maximum number of iterations of trajectory optimization for a demonstration; with "ilqr", 0 to
-            use the environment's controller instead.
-        plan_batch: demonstrations planned at once.
+        plan_iterations: iterations of trajectory optimization for a demonstration: with "ilqr" their maximum number, or
+            0 to use the environment's controller instead; with "sampling" their number, 8 in all that was measured.
+        plan_batch: demonstrations planned at once; with "sampling" each of them rolls out up to 64 candidates at once.
     """
 
     tasks: int = 1500

@@ -10,6 +10,7 @@ import mujoco
 
 from milx.config.schema import DataConfig
 from milx.core import platform, pytrees
+from milx.core.messages import warn
 from milx.envs.base import Env
 from milx.trajopt import expert
 from milx.trajopt.expert import Sampling
@@ -19,15 +20,16 @@ from milx.trajopt.planner import Plans, Settings, find_plans
 EXPERTS = ("ilqr", "sampling")
 SETTINGS = Settings()
 """Of experts by sampling."""
-NOISE = 0.1
-"""Standard deviation of the noise under which the plans must succeed with which others begin."""
 
 
 def expert_of(env: Env, config: DataConfig) -> Options | Sampling:
     """Returns the expert that a run's settings ask for.
 
-    The first expert by sampling of an environment searches for plans with which others begin, and keeps them in the
-    user's cache.
+    The first expert by sampling of an environment searches for plans with which others begin, under the same noise, and
+    keeps them in the user's cache.
+
+    Warns:
+        if fewer than half of these plans succeed, or so few that a scene cannot try as many as it should.
 
     Raises:
         ValueError: for another name than those of EXPERTS, or sampling without an iteration.
@@ -39,7 +41,11 @@ def expert_of(env: Env, config: DataConfig) -> Options | Sampling:
     if config.plan_iterations < 1:
         raise ValueError(f"data.plan_iterations: got {config.plan_iterations}, expected at least 1 with sampling")
     search = dataclasses.replace(SETTINGS.search, iterations=config.plan_iterations)
-    return Sampling(dataclasses.replace(SETTINGS, search=search), _plans(env, SETTINGS))
+    plans = _plans(env, SETTINGS, config.noise)
+    succeeded = int(plans.success.sum())
+    if succeeded < max(SETTINGS.scenes / 2, min(SETTINGS.tried, SETTINGS.scenes)):
+        warn(f"only {succeeded} of the {SETTINGS.scenes} plans succeed with which demonstrations of {env.name} begin")
+    return Sampling(dataclasses.replace(SETTINGS, search=search), plans)
 
 
 def description(config: DataConfig) -> list:
@@ -49,10 +55,10 @@ def description(config: DataConfig) -> list:
 
 
 @functools.cache
-def _plans(env: Env, settings: Settings) -> Plans:
-    request = [env.name, repr(settings), env.action_cost, NOISE, jax.default_backend()]
+def _plans(env: Env, settings: Settings, noise: float) -> Plans:
+    request = [env.name, repr(settings), env.action_cost, noise, jax.default_backend()]
     request += [jax.__version__, mujoco.__version__, env.version, expert.VERSION]
     digest = hashlib.sha256(json.dumps(request).encode()).hexdigest()[:16]
-    find = functools.partial(find_plans, env, settings, NOISE, jax.random.key(0))
+    find = functools.partial(find_plans, env, settings, noise, jax.random.key(0))
     path = platform.cache_folder() / "plans" / f"{env.name}-{digest}.npz"
     return pytrees.kept(path, find, lambda: jax.eval_shape(find))

@@ -75,9 +75,12 @@ def collect(
         config: noise on the actions, and settings of the planner.
         parts: how the names of files begin that keep what is planned at once, so that a process that was killed goes on
             with the next; None for no files.
+
+    Raises:
+        ValueError: for an expert that does not exist.
     """
-    tasks, each, state, keys = _draw(env, jax.random.fold_in(key, SPLITS.index(split)), split, num_tasks, num_demos)
     options, numbers = expert_of(env, config), itertools.count()
+    tasks, each, state, keys = _draw(env, jax.random.fold_in(key, SPLITS.index(split)), split, num_tasks, num_demos)
     tactic = None if config.plan_iterations else choose_tactics(env, each, state, config.plan_batch)
 
     def plan_part(task: Task, state: State, key: jax.Array, tactic: Any) -> tuple[State, jax.Array]:
@@ -243,7 +246,8 @@ def cached(
     """Returns what `collect` does, from `folder` if it is there: sets are kept under a hash of all that they depend on.
 
     The hash covers the arguments, the kind of device, and the versions of JAX, MuJoCo, the environment and the experts.
-    How many demonstrations are planned at once is left out: it changes no more than rounding.
+    How many demonstrations are planned at once is left out: it changes no more than rounding, by which an expert by
+    sampling may choose another of two plans that are nearly as good.
     """
     request = [env.name, seed, split, num_tasks, num_demos, *description(config), env.action_cost]
     request += [jax.default_backend(), jax.__version__, mujoco.__version__, env.version, expert.VERSION]

@@ -226,6 +226,9 @@ def evaluate_baselines(env: Env, demos: DemoSet, config: EvalConfig, expert: Dat
 
     They run in the first `config.baseline_trials` of every task's trials. The task-blind expert goes to a random
     candidate; the expert does without noise what it planned or rehearsed.
+
+    Raises:
+        ValueError: for an expert that does not exist.
     """
     num_trials = min(config.baseline_trials, config.trials)
     total = demos.num_tasks * num_trials  # said, as arrays without entries do not tell

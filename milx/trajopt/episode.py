@@ -30,7 +30,7 @@ def with_controls(
     Args:
         problem: in the model's own actions, to whose limits what the law computes is clipped. Every function of it
             calls the law anew.
-        law: maps the state x [n] and controls [k] to actions [m], as `OperationalSpace.command` may.
+        law: maps the state x [n] and controls [k] to actions [m], as the `action` of an environment's `Steering` does.
         low: the lowest controls [k].
         high: the highest controls [k].
 

@@ -1,10 +1,10 @@
-"""Demonstrations by sampling: of any environment with costs, and without a controller that knows the task.
+"""This module demonstrates by sampling, in any environment with costs, without a controller that knows the task.
 
 In each scene a search (`sampling.py`) begins with the cheapest of the plans of the nearest scenes in which a plan
-succeeded, is improved, and is executed: the robot returns to its path (`Env.steering`) while noise drives it off, and
-every few steps what is left is planned again (`replanning.execute`). Candidates are rolled out by
-`Env.approximate_step`, and what is executed happens by `Env.step`. Scenes are near each other when the running
-residuals of their first states are.
+succeeded, and improves it. The plan is then executed: the robot returns to its path (`Env.steering`) while noise drives
+it off, and every few steps what is left is planned again (`replanning.execute`). Candidates are rolled out by
+`Env.approximate_step`, and what is executed happens by `Env.step`. The nearest scenes are those whose first states have
+the most similar running residuals.
 
 Reference:
     Laskey et al., "DART: noise injection for robust imitation learning", CoRL 2017 (the recorded action is the one
@@ -37,12 +37,15 @@ class Settings:
         scenes: M, in which plans are searched for from nothing, for other scenes to begin with.
         from_nothing: iterations of those searches.
         search: how a plan is improved that begins with those of other scenes.
-        again: how what is left of a plan is planned again.
+        again: how what is left of a plan is planned again, with a spline of the same order.
         every: number of time steps from one plan to the next. It is the largest divisor of the horizon that is at most
             this.
-        knots: K, of a plan's spline.
+        knots: K, of a plan's spline; at most the horizon.
         near: deviation of candidates around a plan that is nearly right, as a fraction of the steering's.
         tried: number of plans that a scene tries first.
+
+    Raises:
+        ValueError: for a number that is too small, or splines of two orders.
     """
 
     scenes: int = 512
@@ -53,6 +56,15 @@ class Settings:
     knots: int = 10
     near: float = 0.3
     tried: int = 64
+
+    def __post_init__(self) -> None:
+        for field in ("scenes", "from_nothing", "every", "knots", "tried"):
+            if (value := getattr(self, field)) < 1:
+                raise ValueError(f"{field}: got {value}, expected at least 1")
+        if self.near <= 0:
+            raise ValueError(f"near: got {self.near}, expected more than 0")
+        if self.again.order != self.search.order:
+            raise ValueError(f"again.order: got {self.again.order}, expected search.order = {self.search.order}")
 
 
 class Plans(NamedTuple):
@@ -83,7 +95,8 @@ class Planner:
     def problem(self, task: Task, start: State) -> Problem:
         """States what is planned: the environment's costs, by its steering, in its approximate dynamics."""
         steering, problem = self._steering, problem_of(self.env, task, start)
-        problem = problem._replace(dynamics=problem.approximation or problem.dynamics)
+        if problem.approximation:
+            problem = problem._replace(dynamics=problem.approximation, approximation=None)
         return with_controls(
             problem, lambda x, u: steering.action(start.with_vector(x), u), steering.low, steering.high
         )
@@ -94,14 +107,19 @@ class Planner:
 
     def begin(self) -> Search:
         """Begins a search without a plan."""
-        knots = jnp.zeros((self.settings.knots, len(self._steering.low)))
+        knots = jnp.zeros((min(self.settings.knots, self.env.horizon), len(self._steering.low)))
         return sampling.start(knots, self._steering.deviation)
 
     def begin_from(self, task: Task, start: State, plans: Plans) -> Search:
-        """Begins a search with the cheapest of the plans of the nearest scenes in which a plan succeeded."""
+        """Begins a search with the cheapest of the plans of the nearest scenes in which a plan succeeded.
+
+        Where fewer than `tried` succeeded, the nearest of them takes the places of those that are missing, and where
+        none did, the search begins with one that failed.
+        """
         squares = jnp.square(plans.features - self.features(task, start)).sum(axis=1)
         squares = jnp.where(plans.success, squares, jnp.inf)
         _, nearest = jax.lax.top_k(-squares, min(self.settings.tried, len(squares)))
+        nearest = jnp.where(plans.success[nearest], nearest, nearest[0])
         options, horizon = self.settings.search, self.env.horizon
         problem = self.problem(task, start)
         return sampling.start_from(problem, start.vector, plans.knots[nearest], self._near, horizon, options)
@@ -162,7 +180,7 @@ def demonstrate(
     start: State,
     key: jax.Array,
 ) -> tuple[State, jax.Array]:
-    """Demonstrates a batch of N scenes, which begins with plans.
+    """Demonstrates in a batch of N scenes, whose searches begin with the plans of others.
 
     Args:
         env: the environment.
@@ -196,6 +214,9 @@ def find_plans(env: Env, settings: Settings, noise: jax.Array | float, key: jax.
         settings: of the planner, of which `scenes` is M.
         noise: standard deviation of the noise on the actions, in their units.
         key: draws all that is random.
+
+    Returns:
+        The plans [M], those that failed among them.
     """
 
     def one(noise: jax.Array, key: jax.Array) -> Plans:

@@ -42,7 +42,17 @@ def test_ilqr_has_the_iterations_of_the_settings(env):
     assert experts.description(DataConfig(noise=0.2, plan_iterations=7)) == [0.2, 7]
 
 
-def test_plans_are_found_once_and_kept(env, tmp_path, monkeypatch):
+def test_all_that_decides_on_demonstrations_by_sampling_describes_them(monkeypatch):
+    config = DataConfig(expert="sampling", plan_iterations=4)
+    described = [experts.description(config)]
+    for changes in ({"expert": "ilqr"}, {"noise": 0.3}, {"plan_iterations": 5}):
+        described.append(experts.description(dataclasses.replace(config, **changes)))
+    monkeypatch.setattr(experts, "SETTINGS", FEW)
+    described.append(experts.description(config))
+    assert all(one != other for i, one in enumerate(described) for other in described[:i])
+
+
+def test_plans_are_found_once_and_kept(env, tmp_path, monkeypatch, capsys):
     """A second process reads the file that the first has written; other settings have another file."""
     rng = np.random.default_rng(0)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
@@ -50,14 +60,14 @@ def test_plans_are_found_once_and_kept(env, tmp_path, monkeypatch):
         experts,
         "find_plans",
         lambda env, settings, noise, key: Plans(
-            rng.random((8, 15), "float32"), rng.random((8, settings.knots, 6), "float32"), rng.random(8) < 0.5
+            rng.random((8, 15), "float32"), rng.random((8, settings.knots, 6), "float32"), rng.random(8) < 0.4
         ),
     )
 
-    def plans(settings, iterations):
+    def plans(settings, iterations, noise=0.1):
         experts._plans.cache_clear()
         monkeypatch.setattr(experts, "SETTINGS", settings)
-        expert = experts.expert_of(env, DataConfig(expert="sampling", plan_iterations=iterations))
+        expert = experts.expert_of(env, DataConfig(expert="sampling", plan_iterations=iterations, noise=noise))
         assert expert.settings.search.iterations == iterations
         return expert.plans
 
@@ -66,8 +76,14 @@ def test_plans_are_found_once_and_kept(env, tmp_path, monkeypatch):
     for one, same in zip(first, again, strict=True):
         np.testing.assert_array_equal(one, same)
     assert other.knots.shape == (8, 5, 6)
-    assert len(list((tmp_path / "milx" / "plans").glob("place-*.npz"))) == 2
+    assert not np.array_equal(plans(FEW, 3, noise=0.2).knots, first.knots)
+    assert len(list((tmp_path / "milx" / "plans").glob("place-*.npz"))) == 3
     experts._plans.cache_clear()
+    succeeded = int(first.success.sum())
+    assert succeeded < 8
+    assert (
+        f"only {succeeded} of the 8 plans succeed with which demonstrations of place begin" in capsys.readouterr().err
+    )
 
 
 @pytest.mark.slow

@@ -114,13 +114,18 @@ def test_the_hand_of_place_returns_to_where_it_is_expected():
 
 def test_the_approximation_of_push_moves_the_arm_as_the_environment_does(push, free, monkeypatch):
     """MuJoCo moves the free arm for half a second by either settings, to within a thousandth of its way."""
-    used = []
-    monkeypatch.setattr(
-        type(push), "_advance", lambda self, model, *rest: used.append((model.opt, rest[-1])) or rest[0]
-    )
+    used, given = [], []
+
+    def advance(self, model, state, action, substeps):
+        used.append((model.opt, substeps))
+        given.append((model.replace(opt=push.model.opt), state, action))
+        return state
+
+    monkeypatch.setattr(type(push), "_advance", advance)
     task, action = push.sample_task(jax.random.key(0), "train"), jnp.array([0.3, 0.2, -0.2, 0.1, 0.2, -0.3, 0.1])
     for step in (type(push).step, type(push).approximate_step):
         step.__wrapped__(push, task, free, action)
+    jax.tree.map(np.testing.assert_array_equal, *given)
     ends = []
     for option, substeps in used:
         model = copy.copy(push.mj_model)

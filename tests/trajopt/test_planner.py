@@ -99,7 +99,7 @@ def test_a_search_begins_with_the_cheapest_plan_of_the_nearest_scenes_where_one_
     success = np.array([True, False, True, True, False, True])
     plans = Plans(rng.normal(size=(6, 2)), rng.uniform(-1, 1, (6, 4, 1)), success)
     begin = jax.jit(Planner(cart, SETTINGS).begin_from)
-    for task, start in zip(scenes[0][:5], jax.vmap(lambda x: x)(scenes[1]).qpos[:5], strict=True):
+    for task, start in zip(scenes[0][:5], scenes[1].qpos[:5], strict=True):
         state = State(start, jnp.zeros(1), jnp.zeros((0, 3)))
         distance = np.linalg.norm(plans.features - np.array([float((start - task)[0]), 0.0]), axis=1)
         near = [i for i in np.argsort(distance) if success[i]][:2]
@@ -108,6 +108,41 @@ def test_a_search_begins_with_the_cheapest_plan_of_the_nearest_scenes_where_one_
         np.testing.assert_allclose(search.knots, plans.knots[near[np.argmin(costs)]], rtol=1e-6)
         np.testing.assert_allclose(search.cost, min(costs), rtol=1e-4)
         np.testing.assert_allclose(search.deviation, 0.3 * 0.5, rtol=1e-6)
+
+
+def test_a_search_never_begins_with_a_plan_that_failed_while_there_is_one_that_succeeded(cart, scenes):
+    """The only plan that succeeded is far away and costs more than the others."""
+    task, start = jax.tree.map(lambda x: x[0], scenes[:2])
+    knots = np.zeros((6, 4, 1))
+    knots[4] = -2.0
+    plans = Plans(np.zeros((6, 2)) + 5 * np.eye(6)[:, 4:5], knots, np.arange(6) == 4)
+    search = Planner(cart, SETTINGS).begin_from(task, start, plans)
+    np.testing.assert_allclose(search.knots, knots[4])
+    assert search.cost > cost(cart, task, start, knots[0])
+
+
+def test_plans_belong_to_their_scenes(cart, plans):
+    """Draws the third scene again, and searches there alone."""
+    task_key, scene_key, search_key, _ = jax.random.split(jax.random.split(jax.random.key(0), 6)[2], 4)
+    task = cart.sample_task(task_key, "train")
+    start = cart.reset(scene_key, task)
+    np.testing.assert_allclose(plans.features[2], [float((start.qpos - task)[0]), 0.0], atol=1e-6)
+    alone = Planner(cart, SETTINGS)
+    search = alone.improve(task, start, alone.begin(), search_key, SETTINGS.from_nothing)
+    np.testing.assert_allclose(plans.knots[2], search.knots, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"every": 0}, "every: got 0, expected at least 1"),
+        ({"near": 0.0}, r"near: got 0\.0, expected more than 0"),
+        ({"again": Options(order=3)}, r"again\.order: got 3, expected search\.order = 1"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(SETTINGS, **changes)
 
 
 def test_plans_are_found_and_demonstrations_begin_with_them(cart, scenes, plans):

@@ -170,7 +170,10 @@ class Place(Env[PlaceTask]):
 
     @property
     def steering(self) -> Steering:
-        """The actions; the hand returns to where it is expected, and to how it is turned there."""
+        """The actions [6]; the hand returns to where it is expected, and to how it is turned there.
+
+        It turns back at a rate of TRACKING times the sine of the angle, about the axis between the two.
+        """
 
         def correction(state: State, expected: State) -> jax.Array:
             (tip, axes, _), (goal, wanted, _) = self.hand(state.qpos), self.hand(expected.qpos)

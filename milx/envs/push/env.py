@@ -215,14 +215,14 @@ class Push(Env[PushTask]):
 
     @property
     def steering(self) -> Steering:
-        """The hand's velocity along x, y and z (m/s), and its turning about z (rad/s)."""
+        """The hand's velocity [4] along x, y and z (m/s), and its turning about z (rad/s)."""
         return steering.hand_velocity(self)
 
     @functools.partial(jax.jit, static_argnums=0)
     def approximate_step(self, task: PushTask, state: State, action: jax.Array) -> State:
         """Takes three physics steps instead of five, with two iterations of the contact solver instead of six.
 
-        Each of its line searches evaluates at most four points instead of eight.
+        Each of its line searches evaluates at most four points instead of eight. iLQR's derivatives are of these, too.
         """
         model = self.model_of(task)
         timestep = jnp.asarray(self.substeps * self.mj_model.opt.timestep / _FEWER_STEPS, float)

@@ -182,7 +182,7 @@ class Reach(Env[ReachTask]):
 
     @property
     def steering(self) -> Steering:
-        """The motors' commands, in tenths; `_regulator` returns the joints to their path."""
+        """The motors' commands [2], in tenths; `_regulator` returns the joints to their path."""
         low, high = self.action_range
         stiffness, brake = self._regulator
 
@@ -194,7 +194,7 @@ class Reach(Env[ReachTask]):
 
     @property
     def _regulator(self) -> tuple[float, np.ndarray]:
-        """The gains of commands on angles (1/rad) and velocities (s/rad).
+        """The gains of commands on angles (1/rad), and on velocities ([2], s/rad).
 
         The regulator that minimizes the integral of (l (q - q*))^2 + (a u)^2, of an inertia j that is driven by g u
         without damping, has the gains l / a and sqrt(2 j l / (a g)).
