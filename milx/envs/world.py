@@ -65,6 +65,13 @@ class World(abc.ABC, Generic[TaskT]):
         image_shape: (H, W) of the published experiment.
         camera: the MJCF camera that the policy sees through.
         vision: whether the policy sees the image; if not, the state tells it where the objects are.
+
+    Args:
+        model: whose actuators all have a range.
+        image_shape: (H, W), another than the published experiment's.
+
+    Raises:
+        ValueError: for an actuator without a range.
     """
 
     substeps: int
@@ -74,6 +81,9 @@ class World(abc.ABC, Generic[TaskT]):
 
     def __init__(self, model: mujoco.MjModel, image_shape: tuple[int, int] | None = None):
         platform.warn_if_not_configured()
+        if len(unlimited := np.flatnonzero(~model.actuator_ctrllimited.astype(bool))):
+            name = model.actuator(unlimited[0]).name
+            raise ValueError(f"ctrlrange: got none for actuator {name!r}, expected the lowest and highest action")
         self.mj_model = model
         device = jax.local_devices()[0]  # MJX would take the first of all, which may be another host's
         self.model = mjx.put_model(model, device)
