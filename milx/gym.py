@@ -108,7 +108,7 @@ class GymEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
             A demonstration [T, ...] of NumPy arrays.
 
         Raises:
-            ValueError: for an expert that does not exist.
+            ValueError: as `expert_of`, and without iterations where the environment has no controller.
         """
         config = config or make_config(self.env.name, preset="fast").data
         scene = self._reset(self._key(), self._task)

@@ -1,7 +1,7 @@
 """Demonstrations by sampling alone: how many succeed under the preset's noise, and how long it takes to plan them.
 
     python experiments/planning/demonstrate.py                                # 9,216 scenes of push, on a GPU
-    python experiments/planning/demonstrate.py --envs=reach --envs=place --scenes=512
+    python experiments/planning/demonstrate.py --envs=reach --envs=place --scenes=512 --batch=128
     python experiments/planning/demonstrate.py --envs=place --scenes=64 --batch=64    # on two cores
 
 Planned as a run with `data.expert = "sampling"` plans (`milx.data.experts`). The plans with which all scenes begin are
@@ -57,7 +57,9 @@ def measure(env: Env, config: DataConfig, scenes: int) -> Iterator[dict[str, Any
 
 def main(_: list[str]) -> None:
     """Measures, and writes the files."""
-    os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp()
+    temporary = tempfile.TemporaryDirectory()
+    os.environ["XDG_CACHE_HOME"] = temporary.name
+    os.environ.pop("JAX_COMPILATION_CACHE_DIR", None)
     milx.configure()
     folder = pathlib.Path(_OUT.value)
     folder.mkdir(parents=True, exist_ok=True)

@@ -50,8 +50,9 @@ class DataConfig:
         expert: how demonstrations are planned: "ilqr", or "sampling", which needs no derivatives and no controller
             (`milx.trajopt.planner`).
         plan_iterations: iterations of trajectory optimization for a demonstration: with "ilqr" their maximum number, or
-            0 to use the environment's controller instead; with "sampling" their number, 8 in all that was measured.
-        plan_batch: demonstrations planned at once; with "sampling" each of them rolls out up to 64 candidates at once.
+            0 to use the environment's controller instead; with "sampling" their number, 8 in the results that are
+            reported.
+        plan_batch: demonstrations planned at once; with "sampling" each of them rolls out 64 plans at once.
     """
 
     tasks: int = 1500

@@ -28,8 +28,7 @@ def expert_of(env: Env, config: DataConfig) -> Options | Sampling:
     The first expert by sampling of an environment searches for plans with which others begin, under the same noise, and
     keeps them in the user's cache.
 
-    Warns:
-        if fewer than half of these plans succeed, or so few that a scene cannot try as many as it should.
+    It says so if fewer than half of these plans succeed.
 
     Raises:
         ValueError: for another name than those of EXPERTS, or sampling without an iteration.
@@ -41,11 +40,7 @@ def expert_of(env: Env, config: DataConfig) -> Options | Sampling:
     if config.plan_iterations < 1:
         raise ValueError(f"data.plan_iterations: got {config.plan_iterations}, expected at least 1 with sampling")
     search = dataclasses.replace(SETTINGS.search, iterations=config.plan_iterations)
-    plans = _plans(env, SETTINGS, config.noise)
-    succeeded = int(plans.success.sum())
-    if succeeded < max(SETTINGS.scenes / 2, min(SETTINGS.tried, SETTINGS.scenes)):
-        warn(f"only {succeeded} of the {SETTINGS.scenes} plans succeed with which demonstrations of {env.name} begin")
-    return Sampling(dataclasses.replace(SETTINGS, search=search), plans)
+    return Sampling(dataclasses.replace(SETTINGS, search=search), _plans(env, SETTINGS, config.noise))
 
 
 def description(config: DataConfig) -> list:
@@ -61,4 +56,10 @@ def _plans(env: Env, settings: Settings, noise: float) -> Plans:
     digest = hashlib.sha256(json.dumps(request).encode()).hexdigest()[:16]
     find = functools.partial(find_plans, env, settings, noise, jax.random.key(0))
     path = platform.cache_folder() / "plans" / f"{env.name}-{digest}.npz"
-    return pytrees.kept(path, find, lambda: jax.eval_shape(find))
+    plans = pytrees.kept(path, find, lambda: jax.eval_shape(find))
+    if (succeeded := int(plans.success.sum())) < settings.scenes / 2:
+        begin = f"of the {settings.scenes} plans with which demonstrations of {env.name} begin"
+        warn(
+            f"only {succeeded} {begin} succeed, expected half of them; its costs, its steering or data.noise may be why"
+        )
+    return plans

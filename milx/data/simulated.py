@@ -77,7 +77,7 @@ def collect(
             with the next; None for no files.
 
     Raises:
-        ValueError: for an expert that does not exist.
+        ValueError: as `expert_of`, and without iterations where the environment has no controller.
     """
     options, numbers = expert_of(env, config), itertools.count()
     tasks, each, state, keys = _draw(env, jax.random.fold_in(key, SPLITS.index(split)), split, num_tasks, num_demos)

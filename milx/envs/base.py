@@ -1,7 +1,8 @@
 """The environment interface: what planners, benchmarks and policies ask of a world (`milx.envs.world`).
 
-All are pure functions of a task and a state, batched by `jax.vmap`. An environment needs `sample_task` and
-`reset`, the planner's `running_residual`, and the benchmark's `success` and `task_blind`; all else has a default.
+They ask by pure functions of a task and a state, which `jax.vmap` batches. An environment needs six class attributes
+(`name`, `criterion`, `horizon`, `substeps`, `image_shape`, `camera`) and five methods: `sample_task` and `reset`, the
+planner's `running_residual`, and the benchmark's `success` and `task_blind`. All else has a default.
 """
 
 import abc
@@ -19,7 +20,7 @@ __all__ = ["ASSETS", "OUT_OF_THE_WAY", "Env", "State", "Task", "check_split"]
 
 
 class Env(World[TaskT]):
-    """A world with tasks.
+    """A world in which tasks are drawn, planned and judged.
 
     Subclasses set the class attributes and write the abstract methods. All methods are pure and take one world;
     `jax.vmap` gives batches.
@@ -90,11 +91,12 @@ class Env(World[TaskT]):
     def steering(self) -> Steering:
         """What the planner by sampling chooses.
 
-        Unless overridden, the controls [A] are the actions, and nothing returns the robot to its path.
+        Unless overridden, the controls [A] are the actions, scaled to [-1, 1], and nothing returns the robot to its
+        path.
         """
         low, high = self.action_range
-        controls = lambda state, u: u  # noqa: E731
-        return Steering(low, high, 0.15 * (high - low), controls, lambda state, expected: jnp.zeros_like(low))
+        one, middle, half = jnp.ones_like(low), (low + high) / 2, (high - low) / 2
+        return Steering(-one, one, 0.3 * one, lambda state, u: middle + half * u, lambda state, expected: 0 * one)
 
     def approximate_step(self, task: TaskT, state: State, action: jax.Array) -> State:
         """Approximates `step` for planners: iLQR differentiates it, and sampling rolls candidates out by it.

@@ -15,7 +15,8 @@ class Steering:
         low: their lowest values, [k].
         high: their highest values, [k].
         deviation: standard deviation of what the planner tries first, [k] in the same units. Controls should be scaled
-            so that it is about 0.3 for most of them, since the search never tries less than 0.03.
+            so that it is about 0.3 for most of them, since a search does not become narrower than 0.03
+            (`planner.SEARCH`).
         action: maps a `State` and controls [k] to an action [A], which is clipped afterwards.
         correction: maps the state that was reached and the state that the plan expected to what is added to the
             controls [k], so that the robot returns to its path; the sum may exceed `low` and `high`.

@@ -67,11 +67,8 @@ class World(abc.ABC, Generic[TaskT]):
         vision: whether the policy sees the image; if not, the state tells it where the objects are.
 
     Args:
-        model: whose actuators all have a range.
-        image_shape: (H, W), another than the published experiment's.
-
-    Raises:
-        ValueError: for an actuator without a range.
+        model: MuJoCo's model.
+        image_shape: (H, W) in pixels; the class attribute if None.
     """
 
     substeps: int
@@ -81,9 +78,6 @@ class World(abc.ABC, Generic[TaskT]):
 
     def __init__(self, model: mujoco.MjModel, image_shape: tuple[int, int] | None = None):
         platform.warn_if_not_configured()
-        if len(unlimited := np.flatnonzero(~model.actuator_ctrllimited.astype(bool))):
-            name = model.actuator(unlimited[0]).name
-            raise ValueError(f"ctrlrange: got none for actuator {name!r}, expected the lowest and highest action")
         self.mj_model = model
         device = jax.local_devices()[0]  # MJX would take the first of all, which may be another host's
         self.model = mjx.put_model(model, device)
@@ -99,7 +93,14 @@ class World(abc.ABC, Generic[TaskT]):
 
     @property
     def action_range(self) -> tuple[jax.Array, jax.Array]:
-        """The lowest and highest action, [A] each; `step` clips to it."""
+        """The lowest and highest action, [A] each; `step` clips to it.
+
+        Raises:
+            ValueError: for an actuator without a range.
+        """
+        if not (limited := self.mj_model.actuator_ctrllimited.astype(bool)).all():
+            named = self._named(int(np.argmin(limited)))
+            raise ValueError(f"ctrlrange: got none for {named}, expected the lowest and highest action")
         low, high = self.mj_model.actuator_ctrlrange.T
         return jnp.asarray(low, float), jnp.asarray(high, float)
 
@@ -119,11 +120,21 @@ class World(abc.ABC, Generic[TaskT]):
 
         The positions (rad, m) and then the velocities (rad/s, m/s) of the joints that have actuators, in the model's
         order, unless overridden.
+
+        Raises:
+            ValueError: for an actuator that is not on a hinge or a slide, unless overridden.
         """
-        model = self.mj_model
-        on_joint = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
-        joints = np.unique(model.actuator_trnid[on_joint, 0])
+        model, moved = self.mj_model, (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+        for actuator, joint in enumerate(model.actuator_trnid[:, 0]):
+            on_joint = model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_JOINT
+            if not on_joint or mujoco.mjtJoint(model.jnt_type[joint]) not in moved:
+                expected = "a hinge or a slide, or a `robot_state` of the environment's own"
+                raise ValueError(f"{self._named(actuator)}: got no joint that a robot knows, expected {expected}")
+        joints = np.unique(model.actuator_trnid[:, 0])
         return jnp.concatenate([state.qpos[model.jnt_qposadr[joints]], state.qvel[model.jnt_dofadr[joints]]])
+
+    def _named(self, actuator: int) -> str:
+        return f"actuator {actuator} ({self.mj_model.actuator(actuator).name or 'without a name'})"
 
     def colors(self, task: TaskT) -> jax.Array:
         """Returns [G, 4] RGBA in [0, 1] of every geom in this task; those of the model unless overridden."""

@@ -228,7 +228,7 @@ def evaluate_baselines(env: Env, demos: DemoSet, config: EvalConfig, expert: Dat
     candidate; the expert does without noise what it planned or rehearsed.
 
     Raises:
-        ValueError: for an expert that does not exist.
+        ValueError: as `expert_of`, and without iterations where the environment has no controller.
     """
     num_trials = min(config.baseline_trials, config.trials)
     total = demos.num_tasks * num_trials  # said, as arrays without entries do not tell

@@ -40,7 +40,7 @@ class Settings:
         again: how what is left of a plan is planned again, with a spline of the same order.
         every: number of time steps from one plan to the next. It is the largest divisor of the horizon that is at most
             this.
-        knots: K, of a plan's spline; at most the horizon.
+        knots: K, of a plan's spline; the horizon where that is shorter.
         near: deviation of candidates around a plan that is nearly right, as a fraction of the steering's.
         tried: number of plans that a scene tries first.
 
@@ -86,7 +86,7 @@ class Planner:
 
     Args:
         env: the environment.
-        settings: of the planner.
+        settings: those of the planner.
     """
 
     def __init__(self, env: Env, settings: Settings):
@@ -95,8 +95,8 @@ class Planner:
     def problem(self, task: Task, start: State) -> Problem:
         """States what is planned: the environment's costs, by its steering, in its approximate dynamics."""
         steering, problem = self._steering, problem_of(self.env, task, start)
-        if problem.approximation:
-            problem = problem._replace(dynamics=problem.approximation, approximation=None)
+        assert problem.approximation is not None
+        problem = problem._replace(dynamics=problem.approximation, approximation=None)
         return with_controls(
             problem, lambda x, u: steering.action(start.with_vector(x), u), steering.low, steering.high
         )

@@ -60,10 +60,17 @@ def state():
 
 
 def test_an_actuator_without_a_range_is_refused():
-    with pytest.raises(ValueError, match="ctrlrange: got none for actuator 'lift', expected the lowest and highest"):
-        Arm(
-            mujoco.MjModel.from_xml_string(MJCF.replace("<actuator>", '<actuator><motor name="lift" joint="passive"/>'))
-        )
+    unlimited = MJCF.replace("<actuator>", '<actuator><motor name="lift" joint="passive"/>')
+    env = Arm(mujoco.MjModel.from_xml_string(unlimited))
+    with pytest.raises(ValueError, match=r"ctrlrange: got none for actuator 0 \(lift\), expected the lowest"):
+        env.action_range  # noqa: B018
+
+
+def test_an_actuator_whose_joint_the_default_state_cannot_show_is_refused(state):
+    jointed = MJCF.replace("<actuator>", '<actuator><motor jointinparent="elbow" ctrlrange="-1 1"/>')
+    env = Arm(mujoco.MjModel.from_xml_string(jointed))
+    with pytest.raises(ValueError, match=r"actuator 0 \(without a name\): got no joint .*expected a hinge or a slide"):
+        env.robot_state(state)
 
 
 def test_the_robot_knows_the_joints_that_it_can_move(env, state):
@@ -88,7 +95,7 @@ def test_looks_are_those_of_the_model_and_nothing_is_redrawn(env, state):
 
 def test_planners_by_sampling_choose_the_actions(env, state):
     steering = env.steering
-    np.testing.assert_allclose([steering.low, steering.high], env.action_range)
-    np.testing.assert_array_equal(steering.action(state, jnp.array([0.3, 2.0])), jnp.array([0.3, 2.0]))
+    for controls, action in ((steering.low, [-2, -1]), (steering.high, [2, 3]), (jnp.array([0.5, 0.0]), [1, 1])):
+        np.testing.assert_allclose(steering.action(state, controls), action)
     np.testing.assert_array_equal(steering.correction(state, env.reset(None, None)), jnp.zeros(2))
-    np.testing.assert_allclose(steering.deviation, 0.15 * (steering.high - steering.low))
+    np.testing.assert_allclose(steering.deviation, 0.3, rtol=1e-6)

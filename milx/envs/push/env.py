@@ -222,7 +222,7 @@ class Push(Env[PushTask]):
     def approximate_step(self, task: PushTask, state: State, action: jax.Array) -> State:
         """Takes three physics steps instead of five, with two iterations of the contact solver instead of six.
 
-        Each of its line searches evaluates at most four points instead of eight. iLQR's derivatives are of these, too.
+        Each of its line searches evaluates at most four points instead of eight. iLQR differentiates these steps, too.
         """
         model = self.model_of(task)
         timestep = jnp.asarray(self.substeps * self.mj_model.opt.timestep / _FEWER_STEPS, float)
