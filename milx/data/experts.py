@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import hashlib
 import json
+from typing import Any
 
 import jax
 import mujoco
@@ -49,13 +50,16 @@ def description(config: DataConfig) -> list:
     return [config.noise, config.plan_iterations, *sampling]
 
 
+def digest(env: Env, *request: Any) -> str:
+    """Hashes what was asked of an expert, and all versions that what it plans depends on."""
+    versions = [jax.default_backend(), jax.__version__, mujoco.__version__, env.version, expert.VERSION]
+    return hashlib.sha256(json.dumps([env.name, *request, env.action_cost, *versions]).encode()).hexdigest()[:16]
+
+
 @functools.cache
 def _plans(env: Env, settings: Settings, noise: float) -> Plans:
-    request = [env.name, repr(settings), env.action_cost, noise, jax.default_backend()]
-    request += [jax.__version__, mujoco.__version__, env.version, expert.VERSION]
-    digest = hashlib.sha256(json.dumps(request).encode()).hexdigest()[:16]
     find = functools.partial(find_plans, env, settings, noise, jax.random.key(0))
-    path = platform.cache_folder() / "plans" / f"{env.name}-{digest}.npz"
+    path = platform.cache_folder() / "plans" / f"{env.name}-{digest(env, repr(settings), noise)}.npz"
     plans = pytrees.kept(path, find, lambda: jax.eval_shape(find))
     if (succeeded := int(plans.success.sum())) < settings.scenes / 2:
         begin = f"of the {settings.scenes} plans with which demonstrations of {env.name} begin"

@@ -2,27 +2,23 @@
 
 import dataclasses
 import functools
-import hashlib
 import itertools
-import json
 import pathlib
 from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from milx.config.schema import DataConfig, TrainConfig
 from milx.core import files, pytrees
 from milx.core.batching import map_in_chunks
 from milx.core.messages import warn
-from milx.data.experts import description, expert_of
+from milx.data import experts
 from milx.data.frames import frame_indices
 from milx.data.goals import goals
 from milx.envs.base import Env, State, Task
-from milx.trajopt import expert
 from milx.trajopt.expert import choose_tactics, judge, perform
 from milx.types import SPLITS, Demo, TaskBatch
 
@@ -77,9 +73,9 @@ def collect(
             with the next; None for no files.
 
     Raises:
-        ValueError: as `expert_of`, and without iterations where the environment has no controller.
+        ValueError: as `experts.expert_of`, and without iterations where the environment has no controller.
     """
-    options, numbers = expert_of(env, config), itertools.count()
+    options, numbers = experts.expert_of(env, config), itertools.count()
     tasks, each, state, keys = _draw(env, jax.random.fold_in(key, SPLITS.index(split)), split, num_tasks, num_demos)
     tactic = None if config.plan_iterations else choose_tactics(env, each, state, config.plan_batch)
 
@@ -249,9 +245,7 @@ def cached(
     How many demonstrations are planned at once is left out: it changes no more than rounding, by which an expert by
     sampling may choose another of two plans that are nearly as good.
     """
-    request = [env.name, seed, split, num_tasks, num_demos, *description(config), env.action_cost]
-    request += [jax.default_backend(), jax.__version__, mujoco.__version__, env.version, expert.VERSION]
-    digest = hashlib.sha256(json.dumps(request).encode()).hexdigest()[:16]
+    digest = experts.digest(env, seed, split, num_tasks, num_demos, *experts.description(config))
     path = folder / f"{env.name}-{split}-{digest}.npz"
     parts = folder / f"{path.stem}.part-{config.plan_batch}"
     make = functools.partial(collect, env, jax.random.key(seed), split, num_tasks, num_demos, config, parts)
