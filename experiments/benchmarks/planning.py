@@ -28,7 +28,7 @@ import milx
 from milx import envs
 from milx.envs.base import State
 from milx.trajopt import sampling
-from milx.trajopt.episode import problem_of, with_controls
+from milx.trajopt.episode import problem_of, steered
 from milx.trajopt.ilqr import Problem
 from milx.trajopt.sampling import Options
 
@@ -70,10 +70,7 @@ class Scene:
         self.start = self.env.reset(jax.random.key(1), self.task)
         self.options = Options("cross_entropy", samples, order=1, elites=self.elites, deviation_min=DEVIATION_MIN)
         self._torques = problem_of(self.env, self.task, self.start)
-        steering, start = self.env.steering, self.start
-        self._velocities = with_controls(
-            self._torques, lambda x, u: steering.action(start.with_vector(x), u), steering.low, steering.high
-        )
+        self._velocities = steered(self.env, self.task, self.start)
         self._cost_of_torques, self._cost_of_velocities = map(self._cost, (self._torques, self._velocities))
 
     def torques(self) -> Searcher:

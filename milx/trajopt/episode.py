@@ -50,3 +50,10 @@ def with_controls(
         control_high=high,
         approximation=approximation and (lambda x, u: approximation(x, acting(x, u))),
     )
+
+
+def steered(env: Env, task: Task, state: State) -> Problem:
+    """States the problem of an episode in the controls of the environment's steering."""
+    steering = env.steering
+    law = lambda x, u: steering.action(state.with_vector(x), u)  # noqa: E731
+    return with_controls(problem_of(env, task, state), law, steering.low, steering.high)

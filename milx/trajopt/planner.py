@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from milx.core import parallel
 from milx.envs.base import Env, State, Task
 from milx.trajopt import replanning, sampling
-from milx.trajopt.episode import problem_of, with_controls
+from milx.trajopt.episode import steered
 from milx.trajopt.ilqr import Problem
 from milx.trajopt.sampling import Options, Search
 
@@ -94,12 +94,9 @@ class Planner:
 
     def problem(self, task: Task, start: State) -> Problem:
         """States what is planned: the environment's costs, by its steering, in its approximate dynamics."""
-        steering, problem = self._steering, problem_of(self.env, task, start)
-        assert problem.approximation is not None
-        problem = problem._replace(dynamics=problem.approximation, approximation=None)
-        return with_controls(
-            problem, lambda x, u: steering.action(start.with_vector(x), u), steering.low, steering.high
-        )
+        problem = steered(self.env, task, start)
+        assert problem.approximation is not None  # every environment has one
+        return problem._replace(dynamics=problem.approximation)
 
     def features(self, task: Task, start: State) -> jax.Array:
         """Describes a scene by the running residual [R] of its first state, without an action."""
