@@ -16,6 +16,7 @@ from milx.envs import shapes
 from milx.envs.base import ASSETS, OUT_OF_THE_WAY, Env, State, check_split
 from milx.envs.chain import Chain, Pose
 from milx.envs.kinematics import kinematics
+from milx.envs.layout import first_spaced
 from milx.envs.place import containers, drop
 from milx.envs.place.containers import CONTAINERS
 from milx.envs.place.drop import Fall
@@ -153,14 +154,14 @@ class Place(Env[PlaceTask]):
         """Holds the thing over the table and stands the containers on it, at least SPACING apart."""
         place_key, joint_key = jax.random.split(key)
         noise = jax.random.uniform(joint_key, (NUM_JOINTS,), minval=-START_NOISE, maxval=START_NOISE)
-        place = _best_spaced(_draw_places(place_key))
+        place = first_spaced(_draw_places(place_key), SPACING)
         ground = jnp.zeros((NUM_CONTAINERS, 1))
         return State(jnp.array(_START) + noise, jnp.zeros(NUM_JOINTS), jnp.concatenate([place, ground], axis=-1))
 
     def redraw_scene(self, key: jax.Array, task: PlaceTask, states: State) -> State:
         """Keeps the motion and the target, and moves the two other containers elsewhere."""
         target = states.mocap_pos[0, task.target, :2]
-        place = _best_spaced(_draw_places(key).at[:, task.target].set(target))
+        place = first_spaced(_draw_places(key).at[:, task.target].set(target), SPACING)
         return dataclasses.replace(states, mocap_pos=states.mocap_pos.at[..., :2].set(place))
 
     @functools.partial(jax.jit, static_argnums=0)
@@ -320,12 +321,6 @@ def _draw_places(key: jax.Array) -> jax.Array:
     """Samples [_CANDIDATES, 3, 2] positions on the table (m)."""
     shape = (_CANDIDATES, NUM_CONTAINERS, 2)
     return jax.random.uniform(key, shape, minval=jnp.array(LOW), maxval=jnp.array(HIGH))
-
-
-def _best_spaced(draws: jax.Array) -> jax.Array:
-    """Returns the first of the draws that keeps the distances, or the one that comes closest to it: [3, 2]."""
-    gap = jnp.linalg.norm(draws[:, [0, 0, 1]] - draws[:, [1, 2, 2]], axis=-1).min(axis=-1)
-    return draws[jnp.argmax(jnp.minimum(gap, SPACING))]
 
 
 def _build() -> mujoco.MjModel:

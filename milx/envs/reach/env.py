@@ -10,6 +10,7 @@ import numpy as np
 
 from milx.core.mjx import mjx
 from milx.envs.base import ASSETS, Env, State, check_split
+from milx.envs.layout import first_spaced
 from milx.envs.steering import Steering
 
 NUM_OBJECTS = 3
@@ -27,7 +28,7 @@ VELOCITY_COST = 0.02
 _LEVER = 0.12
 """How far the fingertip moves when a joint turns, for the planner's guess (m/rad)."""
 _CANDIDATES = 64
-_UNIT, _DEVIATION = 0.1, 0.3
+_UNIT, _DEVIATION = 0.03, 0.3
 """Of the planner by sampling: a control of 1 in motor commands, and how far its first candidates deviate."""
 
 
@@ -93,14 +94,14 @@ class Reach(Env[ReachTask]):
 
     def reset(self, key: jax.Array, task: ReachTask) -> State:
         """Stands the arm at zero and the cubes uniformly in the arena, at least SPACING apart."""
-        position = _first_spaced(_draw_positions(key))
+        position = first_spaced(_draw_positions(key), SPACING)
         height = jnp.full((NUM_OBJECTS, 1), self._height)
         return State(jnp.zeros(2), jnp.zeros(2), jnp.concatenate([position, height], axis=-1))
 
     def redraw_scene(self, key: jax.Array, task: ReachTask, states: State) -> State:
         """Keeps the motion and the target, and moves the two other cubes elsewhere."""
         target = states.mocap_pos[0, task.target, :2]
-        position = _first_spaced(_draw_positions(key).at[:, task.target].set(target))
+        position = first_spaced(_draw_positions(key).at[:, task.target].set(target), SPACING)
         return dataclasses.replace(states, mocap_pos=states.mocap_pos.at[..., :2].set(position))
 
     def fingertip(self, qpos: jax.Array) -> jax.Array:
@@ -182,7 +183,7 @@ class Reach(Env[ReachTask]):
 
     @property
     def steering(self) -> Steering:
-        """The motors' commands [2], in tenths; `_regulator` returns the joints to their path."""
+        """The motors' commands [2], in units of 0.03; `_regulator` returns the joints to their path."""
         low, high = self.action_range
         stiffness, brake = self._regulator
 
@@ -237,17 +238,11 @@ def _arm() -> mujoco.MjModel:
 
 
 def _draw_positions(key: jax.Array) -> jax.Array:
-    """Samples [_CANDIDATES, 3, 2] positions in the arena (m)."""
-    return jax.random.uniform(key, (_CANDIDATES, NUM_OBJECTS, 2), minval=-EXTENT, maxval=EXTENT)
+    """Samples [_CANDIDATES, 3, 2] positions in the arena (m).
 
-
-def _first_spaced(draws: jax.Array) -> jax.Array:
-    """Returns the first of the draws that keeps the distances: [3, 2].
-
-    Each does with probability 0.31, or 0.23 if one cube must stand in the middle, so one of 64 always does.
+    Three keep the distances with probability 0.31, or 0.23 if one must stand in the middle, so one of 64 always does.
     """
-    gaps = jnp.linalg.norm(draws[:, [0, 0, 1]] - draws[:, [1, 2, 2]], axis=-1)
-    return draws[jnp.argmax(gaps.min(axis=-1) >= SPACING)]
+    return jax.random.uniform(key, (_CANDIDATES, NUM_OBJECTS, 2), minval=-EXTENT, maxval=EXTENT)
 
 
 def _draw_colors(key: jax.Array, split: str) -> jax.Array:
