@@ -16,7 +16,7 @@ from milx.envs.base import Env
 from milx.trajopt import expert
 from milx.trajopt.expert import Sampling
 from milx.trajopt.ilqr import Options
-from milx.trajopt.planner import Plans, Settings, find_plans
+from milx.trajopt.planner import Plans, Settings, find_plans, share_plans
 
 EXPERTS = ("ilqr", "sampling")
 SETTINGS = Settings()
@@ -58,9 +58,10 @@ def digest(env: Env, *request: Any) -> str:
 
 @functools.cache
 def _plans(env: Env, settings: Settings, noise: float) -> Plans:
-    find = functools.partial(find_plans, env, settings, noise, jax.random.key(0))
+    key = jax.random.key(0)
+    find = functools.partial(find_plans, env, settings, noise, key)
     path = platform.cache_folder() / "plans" / f"{env.name}-{digest(env, repr(settings), noise)}.npz"
-    plans = pytrees.kept(path, find, lambda: jax.eval_shape(find))
+    plans = pytrees.kept(path, lambda: share_plans(env, settings, find(), noise, key), lambda: jax.eval_shape(find))
     if (succeeded := int(plans.success.sum())) < settings.scenes / 2:
         begin = f"of the {settings.scenes} plans with which demonstrations of {env.name} begin"
         warn(

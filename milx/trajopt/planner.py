@@ -36,6 +36,9 @@ class Settings:
     Attributes:
         scenes: M, in which plans are searched for from nothing, for other scenes to begin with.
         from_nothing: iterations of those searches.
+        rounds: how often, at most, the scenes that are left without a plan that succeeds begin again with those of
+            others.
+        enough: fraction of the scenes with a plan that succeeds, from which on the others are left without.
         search: how a plan is improved that begins with those of other scenes.
         again: how what is left of a plan is planned again, with a spline of the same order.
         every: number of time steps from one plan to the next. It is the largest divisor of the horizon that is at most
@@ -50,6 +53,8 @@ class Settings:
 
     scenes: int = 512
     from_nothing: int = 24
+    rounds: int = 12
+    enough: float = 0.9
     search: Options = SEARCH
     again: Options = AGAIN
     every: int = 5
@@ -61,6 +66,8 @@ class Settings:
         for field in ("scenes", "from_nothing", "every", "knots", "tried"):
             if (value := getattr(self, field)) < 1:
                 raise ValueError(f"{field}: got {value}, expected at least 1")
+        if self.rounds < 0:
+            raise ValueError(f"rounds: got {self.rounds}, expected at least 0")
         if self.near <= 0:
             raise ValueError(f"near: got {self.near}, expected more than 0")
         if self.again.order != self.search.order:
@@ -217,9 +224,7 @@ def find_plans(env: Env, settings: Settings, noise: jax.Array | float, key: jax.
     """
 
     def one(noise: jax.Array, key: jax.Array) -> Plans:
-        planner, (task_key, scene_key, search_key, key) = Planner(env, settings), jax.random.split(key, 4)
-        task = env.sample_task(task_key, "train")
-        start = env.reset(scene_key, task)
+        planner, (task, start, search_key, key) = Planner(env, settings), _drawn(env, key)
         search = planner.improve(task, start, planner.begin(), search_key, settings.from_nothing)
         states, _ = planner.execute(task, start, search, key, noise)
         return Plans(planner.features(task, start), search.knots, env.success(task, states))
@@ -227,3 +232,52 @@ def find_plans(env: Env, settings: Settings, noise: jax.Array | float, key: jax.
     keys = jax.random.split(key, parallel.round_up(settings.scenes))
     found = parallel.shard_tasks(jax.vmap(one, in_axes=(None, 0)), shared=1)(jnp.asarray(noise, float), keys)
     return jax.tree.map(lambda x: x[: settings.scenes], found)
+
+
+def share_plans(env: Env, settings: Settings, plans: Plans, noise: jax.Array | float, key: jax.Array) -> Plans:
+    """Lets the scenes of `find_plans` in which no plan succeeded begin again with the plans of others, in rounds.
+
+    Args:
+        env: the environment.
+        settings: of the planner; `rounds` and `enough` say for how long.
+        plans: what `find_plans` returned for the other arguments.
+        noise: standard deviation of the noise on the actions, in their units.
+        key: draws all that is random.
+
+    Returns:
+        The plans [M]; those that had succeeded are unchanged.
+    """
+    for number in range(settings.rounds):
+        if plans.success.mean() >= settings.enough:
+            break
+        plans = _shared(env, settings, plans, noise, key, jnp.int32(number))
+    return plans
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _shared(
+    env: Env, settings: Settings, plans: Plans, noise: jax.Array | float, key: jax.Array, number: jax.Array
+) -> Plans:
+    """Plays one round of `share_plans`."""
+
+    def one(plans: Plans, noise: jax.Array, number: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        planner, (task, start, *keys) = Planner(env, settings), _drawn(env, key)
+        search_key, key = (jax.random.fold_in(key, 1 + number) for key in keys)
+        search = planner.begin_from(task, start, plans)
+        search = planner.improve(task, start, search, search_key, settings.search.iterations)
+        states, _ = planner.execute(task, start, search, key, noise)
+        return search.knots, env.success(task, states)
+
+    keys = jax.random.split(key, parallel.round_up(settings.scenes))
+    batched = parallel.shard_tasks(jax.vmap(one, in_axes=(None, None, None, 0)), shared=3)
+    found = batched(plans, jnp.asarray(noise, float), number, keys)
+    knots, success = jax.tree.map(lambda x: x[: settings.scenes], found)
+    new = success & ~plans.success
+    return plans._replace(knots=jnp.where(new[:, None, None], knots, plans.knots), success=plans.success | new)
+
+
+def _drawn(env: Env, key: jax.Array) -> tuple[Task, State, jax.Array, jax.Array]:
+    """Draws a training task, its scene, and keys for a search and its execution."""
+    task_key, scene_key, search_key, key = jax.random.split(key, 4)
+    task = env.sample_task(task_key, "train")
+    return task, env.reset(scene_key, task), search_key, key

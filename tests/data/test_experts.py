@@ -14,7 +14,7 @@ from milx.data.simulated import collect
 from milx.trajopt.ilqr import Options
 from milx.trajopt.planner import Plans, Settings
 
-FEW = Settings(scenes=8)
+FEW = Settings(scenes=8, rounds=0)
 
 
 @pytest.fixture(scope="module")

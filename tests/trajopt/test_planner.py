@@ -136,6 +136,7 @@ def test_plans_belong_to_their_scenes(cart, plans):
     ("changes", "message"),
     [
         ({"every": 0}, "every: got 0, expected at least 1"),
+        ({"rounds": -1}, "rounds: got -1, expected at least 0"),
         ({"near": 0.0}, r"near: got 0\.0, expected more than 0"),
         ({"again": Options(order=3)}, r"again\.order: got 3, expected search\.order = 1"),
     ],
@@ -152,6 +153,29 @@ def test_plans_are_found_and_demonstrations_begin_with_them(cart, scenes, plans)
     assert jax.vmap(cart.success)(task, states).mean() > 0.95
     still = jax.tree.map(lambda x: jnp.repeat(x[:, None], 13, axis=1), start)
     assert jax.vmap(cart.success)(task, still).mean() < 0.5
+
+
+def test_scenes_without_a_plan_begin_again_with_those_of_others(cart, plans):
+    """Spoils all plans but two: without the others' the first scenes fail, as `cost` of their own plan says."""
+    kept = np.arange(6) >= 4
+    spoiled = Plans(plans.features, jnp.where(kept[:, None, None], plans.knots, -2.0), jnp.asarray(kept))
+    shared = planner.share_plans(cart, SETTINGS, spoiled, NOISE, jax.random.key(0))
+    assert shared.success.all()
+    np.testing.assert_array_equal(shared.knots[4:], plans.knots[4:])
+    for number, key in enumerate(jax.random.split(jax.random.key(0), 6)[:4]):
+        task, start, *_ = planner._drawn(cart, key)
+        assert cost(cart, task, start, shared.knots[number]) < 1.5 * cost(cart, task, start, plans.knots[number])
+        assert cost(cart, task, start, shared.knots[number]) < cost(cart, task, start, spoiled.knots[number]) / 5
+
+
+@pytest.mark.parametrize(("enough", "rounds", "expected"), [(0.5, 3, 0), (0.9, 3, 3), (0.9, 0, 0)])
+def test_plans_are_shared_until_enough_scenes_have_one(cart, plans, monkeypatch, enough, rounds, expected):
+    played = []
+    monkeypatch.setattr(planner, "_shared", lambda *given: (played.append(int(given[-1])), given[2])[1])
+    settings = dataclasses.replace(SETTINGS, enough=enough, rounds=rounds)
+    half = plans._replace(success=jnp.arange(6) < 3)
+    planner.share_plans(cart, settings, half, NOISE, jax.random.key(0))
+    assert played == list(range(expected))
 
 
 def test_what_is_executed_is_what_was_recorded_and_noise(cart, scenes, plans):
