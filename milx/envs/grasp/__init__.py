@@ -1,0 +1,1 @@
+"""A hand with two fingers that lifts a thing onto one of three mats."""

@@ -1,0 +1,175 @@
+"""Grasp against C MuJoCo, and the laws of its tasks and scenes."""
+
+import copy
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from milx.envs.grasp import env as grasp
+from milx.envs.grasp.env import Grasp
+from milx.envs.shapes import BY_SPLIT, SHAPES
+
+
+@pytest.fixture(autouse=True, scope="module")
+def float64():
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.fixture(scope="module")
+def env(float64):
+    return Grasp((18, 20))
+
+
+@pytest.fixture(scope="module")
+def tasks(env):
+    return jax.vmap(env.sample_task, in_axes=(0, None))(jax.random.split(jax.random.key(0), 24), "train")
+
+
+@pytest.fixture(scope="module")
+def starts(env, tasks):
+    return jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(1), len(tasks.target)), tasks)
+
+
+def first(tree, number=0):
+    """Takes one of a batch."""
+    return jax.tree.map(lambda x: x[number], tree)
+
+
+def c_model(env, task):
+    """Compiles MuJoCo's own model of a task."""
+    model, ours = copy.copy(env.mj_model), jax.jit(env.model_of)(task)
+    for name in ("geom_pos", "geom_quat", "geom_size"):
+        getattr(model, name)[:] = getattr(ours, name)
+    model.geom_sameframe[:] = 0  # else MuJoCo takes the body's frame for those of geoms that were compiled at 0
+    return model
+
+
+def wanted(task, state):
+    """Lists where the hand goes, and how it closes, in each step of a blind grasp: down, up, over the mat, down."""
+    thing, mat = state.qpos[6:9], state.mocap_pos[task.target]
+    low, way = thing.at[2].set(0.006), mat.at[2].set(0.1)
+    phases = [(thing.at[2].set(0.06), 12, -1), (low, 8, -1), (low, 5, 1), (thing.at[2].set(0.1), 8, 1)]
+    phases += [(way, 14, 1), (mat.at[2].set(0.05), 6, 1), (mat.at[2].set(0.05), 7, -1)]
+    return jnp.stack([jnp.append(place, grip) for place, steps, grip in phases for _ in range(steps)])
+
+
+def act(state, goal):
+    """Moves towards a place without turning."""
+    speed = 8 * (jnp.append(goal[:3], 0.0) - state.qpos[:4])
+    scale = jnp.array([grasp.MAX_SPEED] * 3 + [grasp.MAX_TURN])
+    return jnp.clip(jnp.append(speed / scale, goal[3]), -1, 1)
+
+
+@pytest.fixture(scope="module")
+def shown(env, tasks, starts):
+    """Grasps blindly in every scene: states with axes [24, 60]."""
+
+    def one(task, start):
+        def step(state, goal):
+            state = env.step(task, state, act(state, goal))
+            return state, state
+
+        return jax.lax.scan(step, start, wanted(task, start))[1]
+
+    return jax.jit(jax.vmap(one))(tasks, starts)
+
+
+def in_c(env, task, start):
+    """Grasps blindly in C MuJoCo; returns qpos [60, nq]."""
+    model = c_model(env, task)
+    data = mujoco.MjData(model)
+    data.qpos[:], data.mocap_pos[:] = start.qpos, start.mocap_pos
+    positions = []
+    for goal in wanted(task, start):
+        data.ctrl[:] = act(dataclasses.replace(start, qpos=jnp.asarray(data.qpos)), goal)
+        mujoco.mj_step(model, data, nstep=env.substeps)
+        positions.append(data.qpos.copy())
+    return np.array(positions)
+
+
+def test_the_hand_and_what_lies_on_the_table_move_as_in_mujoco(env, tasks, starts, shown):
+    """Compares the time until the fingers close."""
+    for number in range(4):
+        expected = in_c(env, first(tasks, number), first(starts, number))[:18]
+        np.testing.assert_allclose(shown.qpos[number, :18], expected, atol=1e-4)
+
+
+def test_a_grasp_lifts_as_many_things_as_in_mujoco(env, tasks, starts, shown):
+    """Counts lifted things: how a grasp goes on after its first contact depends on the last digit."""
+    expected = [in_c(env, first(tasks, n), first(starts, n))[32, 8] > 0.06 for n in range(len(tasks.target))]
+    found = shown.qpos[:, 32, 8] > 0.06
+    assert min(np.mean(expected), found.mean()) > 0.8
+    assert abs(np.mean(expected) - found.mean()) < 0.15
+
+
+def test_most_blind_grasps_succeed_and_end_on_the_target_alone(env, tasks, shown):
+    assert jax.vmap(env.success)(tasks, shown).mean() > 0.7
+    other = dataclasses.replace(tasks, target=(tasks.target + 1) % 3)
+    assert not jax.vmap(env.success)(other, shown).any()
+
+
+def test_success_needs_an_open_hand_and_a_thing_that_rests_on_the_mat(env, tasks, starts):
+    task, state = first(tasks), first(starts)
+    place = state.mocap_pos[task.target].at[2].add(env.resting(task))
+
+    def judged(thing, finger):
+        qpos = state.qpos.at[6:9].set(thing).at[4].set(finger)
+        return bool(env.success(task, jax.tree.map(lambda x: x[None], dataclasses.replace(state, qpos=qpos))))
+
+    assert judged(place, 0.04)
+    assert judged(place + jnp.array([0.0, 0.9 * grasp.ON_MAT, 0.0]), 0.04)
+    assert not judged(place + jnp.array([0.0, 1.1 * grasp.ON_MAT, 0.0]), 0.04)
+    assert not judged(place + jnp.array([0.0, 0.0, 1.1 * grasp.RESTING]), 0.04)
+    assert not judged(place, 0.02)
+
+
+def test_things_rest_where_they_are_laid(env, tasks, starts):
+    """Leaves the hand alone: nothing but the hand, which has no brake but its servos, moves by more than 1 mm."""
+    still = jnp.zeros(5).at[4].set(-1.0)
+    wait = jax.jit(jax.vmap(lambda task, start: jax.lax.fori_loop(0, 10, lambda _, s: env.step(task, s, still), start)))
+    after = wait(tasks, starts)
+    assert np.abs(after.qpos[:, 6:9] - starts.qpos[:, 6:9]).max() < 1e-3
+    assert np.abs(after.qpos[:, :4] - starts.qpos[:, :4]).max() < 1e-3
+
+
+def test_scenes_keep_their_distances(env, tasks, starts):
+    mats = starts.mocap_pos
+    gaps = jnp.linalg.norm(mats[:, [0, 0, 1]] - mats[:, [1, 2, 2]], axis=-1)
+    assert gaps.min() >= grasp.SPACING
+    low, high = np.array(grasp.MATS_LOW), np.array(grasp.MATS_HIGH)
+    assert (mats[..., :2] >= low).all() and (mats[..., :2] <= high).all()
+    moved = jax.vmap(env.redraw_scene)(
+        jax.random.split(jax.random.key(2), len(tasks.target)), tasks, jax.tree.map(lambda x: x[:, None], starts)
+    )
+    rows = np.arange(len(tasks.target))
+    np.testing.assert_array_equal(moved.mocap_pos[rows, 0, tasks.target], mats[rows, tasks.target])
+    assert np.abs(moved.mocap_pos[rows, 0, tasks.target - 1] - mats[rows, tasks.target - 1]).max() > 0.01
+
+
+@pytest.mark.parametrize("split", ["train", "validation", "test"])
+def test_kinds_of_things_and_mats_are_those_of_the_split(env, split):
+    drawn = jax.vmap(env.sample_task, in_axes=(0, None))(jax.random.split(jax.random.key(3), 50), split)
+    kinds = np.column_stack([drawn.thing, drawn.mat])
+    assert {list(SHAPES)[kind] for kind in kinds.ravel()} <= set(BY_SPLIT[split])
+    assert all(len(set(row)) == 4 for row in kinds)
+
+
+def test_a_mat_lies_on_the_shelf_with_its_whole_outline(env, tasks, starts):
+    """Measures how far its capsules stand out, in C MuJoCo."""
+    task, start = first(tasks), first(starts)
+    model = c_model(env, task)
+    data = mujoco.MjData(model)
+    data.qpos[:], data.mocap_pos[:] = start.qpos, start.mocap_pos
+    mujoco.mj_forward(model, data)
+    rgba = jax.jit(env.colors)(task)
+    for i in range(3):
+        geoms = np.flatnonzero(model.geom_bodyid == model.body(f"mat_{i}").id)
+        seen = geoms[np.asarray(rgba[geoms, 3]) > 0]
+        assert len(seen) == sum(1 for _ in list(SHAPES.values())[int(task.mat[i])].capsules)
+        tops = data.geom_xpos[seen, 2] + model.geom_size[seen, 0]
+        np.testing.assert_allclose(tops, grasp.SHELF + grasp.MAT_HEIGHT, atol=1e-9)
