@@ -63,7 +63,7 @@ class Reach(Env[ReachTask]):
     goal_indices = (4, 5)
     long_chain = False
     action_cost = 4.0
-    version = 3
+    version = 4
 
     def __init__(self, image_shape: tuple[int, int] | None = None):
         super().__init__(mujoco.MjModel.from_xml_path(str(ASSETS / "reach.xml")), image_shape)
