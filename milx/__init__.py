@@ -5,16 +5,17 @@ same.
 """
 
 import importlib
-from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
-from milx.config.registry import register_env, register_method
-from milx.core.platform import configure
-from milx.deploy.policy import Policy
-from milx.deploy.pretrained import load
-from milx.envs import ENVS, make
-from milx.methods import METHODS
-from milx.types import Demo, Observation
-from milx.worlds.evaluate import evaluate_in
+if TYPE_CHECKING:
+    from milx.config.registry import register_env, register_method
+    from milx.core.platform import configure
+    from milx.deploy.policy import Policy
+    from milx.deploy.pretrained import load
+    from milx.envs import ENVS, make
+    from milx.methods import METHODS
+    from milx.types import Demo, Observation
+    from milx.worlds.evaluate import evaluate_in
 
 __version__ = "0.1.0"
 __all__ = [
@@ -33,8 +34,30 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str) -> ModuleType:
-    """Imports `milx.gym`, which needs Gymnasium and MuJoCo, when it is first used."""
+_HOMES = {
+    "ENVS": "milx.config.registry",
+    "METHODS": "milx.config.registry",
+    "Demo": "milx.types",
+    "Observation": "milx.types",
+    "Policy": "milx.deploy.policy",
+    "configure": "milx.core.platform",
+    "evaluate_in": "milx.worlds.evaluate",
+    "load": "milx.deploy.pretrained",
+    "make": "milx.envs",
+    "register_env": "milx.config.registry",
+    "register_method": "milx.config.registry",
+}
+"""Where the names above are defined."""
+
+
+def __getattr__(name: str) -> Any:
+    """Imports what a name needs when it is first used, so that a part of milx does not import the others.
+
+    `milx.gym` needs Gymnasium and MuJoCo.
+    """
+    if name in _HOMES:
+        globals()[name] = found = getattr(importlib.import_module(_HOMES[name]), name)
+        return found
     if name == "gym":
         try:
             return importlib.import_module("milx.gym")
@@ -43,3 +66,8 @@ def __getattr__(name: str) -> ModuleType:
                 "milx.gym needs Gymnasium and MuJoCo: install milx with the extras 'gym' and 'sim'"
             ) from error
     raise AttributeError(f"module 'milx' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    """Lists the names above, imported or not."""
+    return sorted({*globals(), *__all__})

@@ -2,6 +2,8 @@
 
 import ast
 import pathlib
+import subprocess
+import sys
 
 import pytest
 
@@ -64,3 +66,44 @@ def test_files_are_read_and_written_in_one_place(path):
             # Videos and images are opened by their libraries, data sets by TensorStore.
             if name == "open" and owner not in ("av", "Image", "ts"):
                 assert [ast.unparse(argument) for argument in node.args[:1]] == ["os.devnull"], ast.unparse(node)
+
+
+def printed(code):
+    """Runs Python in a process of its own and returns what it prints."""
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip()
+
+
+def test_rendering_imports_nothing_of_the_other_packages():
+    found = printed("import sys, milx.render; print(*{name.split('.')[1] for name in sys.modules if 'milx.' in name})")
+    assert set(found.split()) == {"core", "render"}
+
+
+@pytest.mark.parametrize(
+    "first",
+    [
+        "import milx; names = milx.ENVS, milx.METHODS",
+        "from milx.methods import METHODS; from milx.envs import ENVS; names = ENVS, METHODS",
+        "from milx.config.registry import *; register_presets('mine', {}); names = ENVS, METHODS",
+        "from milx.config.assemble import make_config; make_config('push'); from milx import *; names = ENVS, METHODS",
+    ],
+)
+def test_what_milx_brings_is_registered_however_it_is_asked_for(first):
+    expected = "reach reach_state push place mil contextual lstm lstm_attention"
+    assert printed(f"{first}; print(*names[0], *names[1])") == expected
+
+
+def test_a_name_that_milx_brings_is_taken_from_the_beginning():
+    code = "from milx.config import registry\ntry: registry.register_presets('push', {})\n"
+    assert (
+        printed(f"{code}except ValueError as error: print(error)")
+        == "presets: 'push' is registered already, expected a name that is free"
+    )
+
+
+def test_all_that_milx_offers_is_found_where_it_says():
+    import milx
+
+    assert {*milx._HOMES, "__version__"} == set(milx.__all__)
+    for name, home in milx._HOMES.items():
+        assert getattr(milx, name) is getattr(sys.modules[home], name)
+    assert set(milx.__all__) <= set(dir(milx))

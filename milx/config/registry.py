@@ -8,6 +8,7 @@ entry point in the group "milx.plugins":
 """
 
 import collections
+import importlib
 import importlib.metadata
 import pkgutil
 import warnings
@@ -40,7 +41,28 @@ class MethodEntry(NamedTuple):
     overrides: Overrides
 
 
-class _Classes(collections.UserDict[str, Any]):
+_OWN = ("milx.envs", "milx.methods", "milx.data")
+"""Packages that register what milx itself brings."""
+_imported: set[str] = set()
+
+
+class _Registry(collections.UserDict[str, Any]):
+    """What is registered, by name. What milx itself brings is imported when the first name is looked up."""
+
+    @property
+    def data(self) -> dict[str, Any]:
+        for package in _OWN:
+            if package not in _imported:
+                _imported.add(package)  # before its import, in which it looks up whether its names are free
+                importlib.import_module(package)
+        return self._entries
+
+    @data.setter
+    def data(self, entries: dict[str, Any]) -> None:
+        self._entries = entries
+
+
+class _Classes(_Registry):
     """Classes by name; one that is registered as "module:class" is imported when it is first asked for."""
 
     def __getitem__(self, name: str) -> Any:
@@ -57,12 +79,12 @@ class _Classes(collections.UserDict[str, Any]):
 
 ENVS: MutableMapping[str, Any] = _Classes()
 """Classes of environments by name. They are called with an image shape (H, W) or None."""
-METHODS: dict[str, MethodEntry] = {}
-PRESETS: dict[str, dict[str, Overrides]] = {}
+METHODS: MutableMapping[str, MethodEntry] = _Registry()
+PRESETS: MutableMapping[str, dict[str, Overrides]] = _Registry()
 """Presets by environment and name: the values in which they differ from the defaults.
 
 Fields that a method does not have are ignored."""
-DURATIONS: dict[str, dict[str, str]] = {}
+DURATIONS: MutableMapping[str, dict[str, str]] = _Registry()
 """How long a run took and on what hardware, in words, by environment and preset; measured for MIL only."""
 
 
