@@ -48,6 +48,19 @@ _HOMES = {
     "register_method": "milx.config.registry",
 }
 """Where the names above are defined."""
+_PACKAGES = (
+    "config",
+    "core",
+    "data",
+    "deploy",
+    "envs",
+    "evaluation",
+    "methods",
+    "networks",
+    "render",
+    "types",
+    "worlds",
+)
 
 
 def __getattr__(name: str) -> Any:
@@ -58,6 +71,8 @@ def __getattr__(name: str) -> Any:
     if name in _HOMES:
         globals()[name] = found = getattr(importlib.import_module(_HOMES[name]), name)
         return found
+    if name in _PACKAGES:
+        return importlib.import_module(f"milx.{name}")
     if name == "gym":
         try:
             return importlib.import_module("milx.gym")

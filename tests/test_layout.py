@@ -107,3 +107,29 @@ def test_all_that_milx_offers_is_found_where_it_says():
     for name, home in milx._HOMES.items():
         assert getattr(milx, name) is getattr(sys.modules[home], name)
     assert set(milx.__all__) <= set(dir(milx))
+
+
+def test_packages_are_found_as_attributes():
+    code = "import milx; print(*(getattr(milx, name).__name__ for name in milx._PACKAGES))"
+    found = printed(code).split()
+    assert set(found) < {f"milx.{path.stem}" for path in (ROOT / "milx").glob("[a-z]*")}
+    assert {"milx.envs", "milx.methods", "milx.render", "milx.data"} < set(found)
+
+
+def test_another_thread_waits_until_all_is_registered():
+    code = """
+import threading
+from milx.config.registry import ENVS
+found = []
+threads = [threading.Thread(target=lambda: found.append(list(ENVS))) for _ in range(4)]
+for thread in threads: thread.start()
+for thread in threads: thread.join()
+print(len(found), *{tuple(names) for names in found})
+"""
+    assert printed(code) == "4 ('reach', 'reach_state', 'push', 'place')"
+
+
+def test_a_registry_is_copied_as_a_dictionary():
+    assert printed(
+        "from milx.config.registry import METHODS; print(*dict(METHODS), len(METHODS), 'mil' in METHODS)"
+    ) == ("mil contextual lstm lstm_attention 4 True")

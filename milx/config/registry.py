@@ -7,12 +7,11 @@ entry point in the group "milx.plugins":
     mine = "my_package"
 """
 
-import collections
 import importlib
 import importlib.metadata
 import pkgutil
 import warnings
-from collections.abc import Callable, MutableMapping
+from collections.abc import Callable, Iterator, MutableMapping
 from typing import Any, NamedTuple
 
 from milx.config.schema import Config, MethodConfig, NetworkConfig
@@ -43,23 +42,38 @@ class MethodEntry(NamedTuple):
 
 _OWN = ("milx.envs", "milx.methods", "milx.data")
 """Packages that register what milx itself brings."""
-_imported: set[str] = set()
 
 
-class _Registry(collections.UserDict[str, Any]):
-    """What is registered, by name. What milx itself brings is imported when the first name is looked up."""
+class _Registry(MutableMapping[str, Any]):
+    """What is registered, by name. What milx itself brings is imported when something is looked up.
+
+    A package that is just being imported looks up whether its names are free. Python then returns to it at once, and
+    lets other threads wait until it is imported.
+    """
+
+    def __init__(self) -> None:
+        self._registered: dict[str, Any] = {}
 
     @property
-    def data(self) -> dict[str, Any]:
+    def _entries(self) -> dict[str, Any]:
         for package in _OWN:
-            if package not in _imported:
-                _imported.add(package)  # before its import, in which it looks up whether its names are free
-                importlib.import_module(package)
-        return self._entries
+            importlib.import_module(package)
+        return self._registered
 
-    @data.setter
-    def data(self, entries: dict[str, Any]) -> None:
-        self._entries = entries
+    def __getitem__(self, name: str) -> Any:
+        return self._entries[name]
+
+    def __setitem__(self, name: str, value: Any) -> None:
+        self._registered[name] = value
+
+    def __delitem__(self, name: str) -> None:
+        del self._registered[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._entries)
+
+    def __len__(self) -> int:
+        return len(self._entries)
 
 
 class _Classes(_Registry):

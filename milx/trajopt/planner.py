@@ -36,9 +36,8 @@ class Settings:
     Attributes:
         scenes: M, in which plans are searched for from nothing, for other scenes to begin with.
         from_nothing: iterations of those searches.
-        rounds: how often, at most, the scenes that are left without a plan that succeeds begin again with those of
-            others.
-        enough: fraction of the scenes with a plan that succeeds, from which on the others are left without.
+        rounds: how often, at most, scenes without a plan that succeeded begin again with the plans of others.
+        enough: fraction of scenes with a plan that succeeded at which these rounds stop.
         search: how a plan is improved that begins with those of other scenes.
         again: how what is left of a plan is planned again, with a spline of the same order.
         every: number of time steps from one plan to the next. It is the largest divisor of the horizon that is at most
@@ -48,7 +47,7 @@ class Settings:
         tried: number of plans that a scene tries first.
 
     Raises:
-        ValueError: for a number that is too small, or splines of two orders.
+        ValueError: for a number that is out of range, or splines of two orders.
     """
 
     scenes: int = 512
@@ -68,6 +67,8 @@ class Settings:
                 raise ValueError(f"{field}: got {value}, expected at least 1")
         if self.rounds < 0:
             raise ValueError(f"rounds: got {self.rounds}, expected at least 0")
+        if not 0 <= self.enough <= 1:
+            raise ValueError(f"enough: got {self.enough}, expected 0 to 1")
         if self.near <= 0:
             raise ValueError(f"near: got {self.near}, expected more than 0")
         if self.again.order != self.search.order:
@@ -237,6 +238,9 @@ def find_plans(env: Env, settings: Settings, noise: jax.Array | float, key: jax.
 def share_plans(env: Env, settings: Settings, plans: Plans, noise: jax.Array | float, key: jax.Array) -> Plans:
     """Lets the scenes of `find_plans` in which no plan succeeded begin again with the plans of others, in rounds.
 
+    Each round plans in all scenes, and keeps what succeeded where nothing had. If no plan has succeeded at all, nothing
+    can begin, and the plans are returned as they are.
+
     Args:
         env: the environment.
         settings: of the planner; `rounds` and `enough` say for how long.
@@ -248,7 +252,7 @@ def share_plans(env: Env, settings: Settings, plans: Plans, noise: jax.Array | f
         The plans [M]; those that had succeeded are unchanged.
     """
     for number in range(settings.rounds):
-        if plans.success.mean() >= settings.enough:
+        if not 0 < plans.success.mean() < settings.enough:
             break
         plans = _shared(env, settings, plans, noise, key, jnp.int32(number))
     return plans
@@ -258,7 +262,7 @@ def share_plans(env: Env, settings: Settings, plans: Plans, noise: jax.Array | f
 def _shared(
     env: Env, settings: Settings, plans: Plans, noise: jax.Array | float, key: jax.Array, number: jax.Array
 ) -> Plans:
-    """Plays one round of `share_plans`."""
+    """Runs one round of `share_plans`."""
 
     def one(plans: Plans, noise: jax.Array, number: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
         planner, (task, start, *keys) = Planner(env, settings), _drawn(env, key)

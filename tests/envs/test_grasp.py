@@ -45,6 +45,7 @@ def c_model(env, task):
     model, ours = copy.copy(env.mj_model), jax.jit(env.model_of)(task)
     for name in ("geom_pos", "geom_quat", "geom_size"):
         getattr(model, name)[:] = getattr(ours, name)
+    model.geom_rbound[model.geom_rbound > 0] = 1.0  # a bound for all sizes
     model.geom_sameframe[:] = 0  # else MuJoCo takes the body's frame for those of geoms that were compiled at 0
     return model
 
@@ -113,23 +114,44 @@ def test_most_blind_grasps_succeed_and_end_on_the_target_alone(env, tasks, shown
     assert not jax.vmap(env.success)(other, shown).any()
 
 
-def test_success_needs_an_open_hand_and_a_thing_that_rests_on_the_mat(env, tasks, starts):
+def test_success_needs_an_open_hand_and_a_thing_that_lies_still_on_the_mat(env, tasks, starts):
     task, state = first(tasks), first(starts)
     place = state.mocap_pos[task.target].at[2].add(env.resting(task))
 
-    def judged(thing, finger):
+    def judged(thing, finger, speed=0.0):
         qpos = state.qpos.at[6:9].set(thing).at[4].set(finger)
-        return bool(env.success(task, jax.tree.map(lambda x: x[None], dataclasses.replace(state, qpos=qpos))))
+        last = dataclasses.replace(state, qpos=qpos, qvel=state.qvel.at[8].set(speed))
+        return bool(env.success(task, jax.tree.map(lambda x: x[None], last)))
 
     assert judged(place, 0.04)
     assert judged(place + jnp.array([0.0, 0.9 * grasp.ON_MAT, 0.0]), 0.04)
     assert not judged(place + jnp.array([0.0, 1.1 * grasp.ON_MAT, 0.0]), 0.04)
     assert not judged(place + jnp.array([0.0, 0.0, 1.1 * grasp.RESTING]), 0.04)
     assert not judged(place, 0.02)
+    assert not judged(place, 0.04, speed=-1.1 * grasp.STILL)
+
+
+def test_the_cost_is_what_its_weights_say(env, tasks, starts):
+    """Compares with distances by NumPy, early and late, far from the mat and on it; its derivatives are finite."""
+    task, state, action = first(tasks), first(starts), jnp.linspace(-1, 1, 5)
+    for place in (state.qpos[6:9], state.mocap_pos[task.target] + jnp.array([0.03, 0.04, 0.1])):
+        for t in (0, env.horizon - 1):
+            qpos = state.qpos.at[6:9].set(place).at[4].set(0.01)
+            off = np.asarray(place - state.mocap_pos[task.target] - jnp.array([0, 0, env.resting(task)]))
+            away = np.hypot(*off[:2])
+            carried = np.interp(away, (grasp.NEAR, grasp.FAR), (0.0, grasp.CARRIED))
+            opened = grasp.OPEN_COST * (0.045 - 0.01) * (t >= env.horizon - grasp.LET_GO)
+            expected = [*grasp.THING_COST * off[:2], grasp.HEIGHT_COST * (off[2] - carried), opened]
+            expected += [*grasp.HAND_COST * np.asarray(qpos[:3] - place), *0.02 * np.asarray(action)]
+            at = dataclasses.replace(state, qpos=qpos)
+            np.testing.assert_allclose(env.running_residual(task, at, action, t), expected, atol=5e-5)
+    slope = jax.jacfwd(lambda qpos: env.running_residual(task, dataclasses.replace(state, qpos=qpos), action, 0))
+    on_mat = state.qpos.at[6:9].set(state.mocap_pos[task.target])
+    assert np.isfinite(slope(on_mat)).all()
 
 
 def test_things_rest_where_they_are_laid(env, tasks, starts):
-    """Leaves the hand alone: nothing but the hand, which has no brake but its servos, moves by more than 1 mm."""
+    """Leaves the open hand alone for half a second: nothing moves by more than 1 mm or 1 mrad."""
     still = jnp.zeros(5).at[4].set(-1.0)
     wait = jax.jit(jax.vmap(lambda task, start: jax.lax.fori_loop(0, 10, lambda _, s: env.step(task, s, still), start)))
     after = wait(tasks, starts)
@@ -139,8 +161,8 @@ def test_things_rest_where_they_are_laid(env, tasks, starts):
 
 def test_scenes_keep_their_distances(env, tasks, starts):
     mats = starts.mocap_pos
-    gaps = jnp.linalg.norm(mats[:, [0, 0, 1]] - mats[:, [1, 2, 2]], axis=-1)
-    assert gaps.min() >= grasp.SPACING
+    gaps = lambda mats: jnp.linalg.norm(mats[:, [0, 0, 1]] - mats[:, [1, 2, 2]], axis=-1)  # noqa: E731
+    assert gaps(mats).min() >= grasp.SPACING
     low, high = np.array(grasp.MATS_LOW), np.array(grasp.MATS_HIGH)
     assert (mats[..., :2] >= low).all() and (mats[..., :2] <= high).all()
     moved = jax.vmap(env.redraw_scene)(
@@ -148,7 +170,9 @@ def test_scenes_keep_their_distances(env, tasks, starts):
     )
     rows = np.arange(len(tasks.target))
     np.testing.assert_array_equal(moved.mocap_pos[rows, 0, tasks.target], mats[rows, tasks.target])
-    assert np.abs(moved.mocap_pos[rows, 0, tasks.target - 1] - mats[rows, tasks.target - 1]).max() > 0.01
+    assert gaps(moved.mocap_pos[:, 0]).min() >= grasp.SPACING
+    distance = np.linalg.norm(moved.mocap_pos[rows, 0, tasks.target - 1] - mats[rows, tasks.target - 1], axis=-1)
+    assert np.mean(distance > 0.01) > 0.9
 
 
 @pytest.mark.parametrize("split", ["train", "validation", "test"])
@@ -159,17 +183,24 @@ def test_kinds_of_things_and_mats_are_those_of_the_split(env, split):
     assert all(len(set(row)) == 4 for row in kinds)
 
 
-def test_a_mat_lies_on_the_shelf_with_its_whole_outline(env, tasks, starts):
-    """Measures how far its capsules stand out, in C MuJoCo."""
-    task, start = first(tasks), first(starts)
-    model = c_model(env, task)
-    data = mujoco.MjData(model)
-    data.qpos[:], data.mocap_pos[:] = start.qpos, start.mocap_pos
-    mujoco.mj_forward(model, data)
-    rgba = jax.jit(env.colors)(task)
-    for i in range(3):
-        geoms = np.flatnonzero(model.geom_bodyid == model.body(f"mat_{i}").id)
-        seen = geoms[np.asarray(rgba[geoms, 3]) > 0]
-        assert len(seen) == sum(1 for _ in list(SHAPES.values())[int(task.mat[i])].capsules)
-        tops = data.geom_xpos[seen, 2] + model.geom_size[seen, 0]
-        np.testing.assert_allclose(tops, grasp.SHELF + grasp.MAT_HEIGHT, atol=1e-9)
+def test_mats_lie_on_the_shelf_with_their_whole_outlines(env, tasks, starts):
+    """Measures in C MuJoCo how far their capsules reach, and stand out."""
+    for number in range(len(tasks.target)):
+        task, start = first(tasks, number), first(starts, number)
+        model = c_model(env, task)
+        data = mujoco.MjData(model)
+        data.qpos[:], data.mocap_pos[:] = start.qpos, start.mocap_pos
+        mujoco.mj_forward(model, data)
+        shelf, colors = model.geom("shelf"), np.asarray(jax.jit(env.colors)(task))
+        for i in range(3):
+            geoms = np.flatnonzero(model.geom_bodyid == model.body(f"mat_{i}").id)
+            seen = geoms[colors[geoms, 3] > 0]
+            assert len(seen) == len(list(SHAPES.values())[int(task.mat[i])].capsules)
+            radius, half = model.geom_size[seen, :2].T[:, :, None]
+            ends = np.concatenate(
+                [data.geom_xpos[seen] + way * half * data.geom_xmat[seen][:, 2::3] for way in (-1, 1)]
+            )
+            tops = data.geom_xpos[seen, 2] + radius[:, 0]
+            np.testing.assert_allclose(tops, grasp.SHELF + grasp.MAT_HEIGHT, atol=1e-9)
+            reach = np.abs(ends - shelf.pos)[:, :2] + np.concatenate([radius, radius])
+            assert (reach <= shelf.size[:2]).all()
