@@ -4,7 +4,8 @@ In each scene a search (`sampling.py`) begins with the cheapest of the plans of 
 succeeded, and improves it. The plan is then executed: the robot returns to its path (`Env.steering`) while noise drives
 it off, and every few steps what is left is planned again (`replanning.execute`). Candidates are rolled out by
 `Env.approximate_step`, and what is executed happens by `Env.step`. The nearest scenes are those whose first states have
-the most similar running residuals.
+the most similar running residuals. The first plans are searched from nothing (`find_plans`); scenes in which that fails
+begin again with those of others (`share_plans`).
 
 Reference:
     Laskey et al., "DART: noise injection for robust imitation learning", CoRL 2017 (the recorded action is the one
