@@ -26,8 +26,8 @@ SETTINGS = Settings()
 def expert_of(env: Env, config: DataConfig) -> Options | Sampling:
     """Returns the expert that a run's settings ask for.
 
-    The first expert by sampling of an environment searches for plans with which others begin, under the same noise, lets
-    scenes that are left without one begin again with those of others, and keeps all in the user's cache.
+    The first expert by sampling of an environment searches for plans with which others begin, under the same noise, and
+    keeps them in the user's cache. Scenes in which that fails begin again with the plans of others.
 
     It says so if fewer than half of these plans succeed.
 
