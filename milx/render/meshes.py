@@ -13,6 +13,9 @@ A ray o + t d meets a triangle a, a + u, a + v if
 
 (Möller & Trumbore, "Fast, minimum storage ray-triangle intersection", 1997). Meshes of robots have some triangles the
 wrong way around, so both sides count, as for `mj_ray`. A camera inside a mesh sees its inside.
+
+The surface faces in the direction (1 - β - γ) n_a + β n_b + γ n_c of MuJoCo's normals at the corners, as in its own
+renderer: where these are those of the triangle, its edges are sharp, and elsewhere the mesh looks smooth.
 """
 
 from typing import NamedTuple
@@ -36,7 +39,7 @@ class Meshes(NamedTuple):
         skip: [N] int32, the node to go on with if the box is not entered.
         first: [N] int32, a leaf's first triangle; -1 if the node has children.
         triangle: [F, 3, 3], a, u and v (m). Leaves with fewer than LEAF triangles repeat their last one.
-        normal: [F, 3], n of unit length; zero for a triangle without an area.
+        normal: [F, 3, 3], unit normals n_a, n_b and n_c at the corners.
         root: [G] int32, the node where a geom's mesh begins; 0 for other geoms.
     """
 
@@ -57,8 +60,10 @@ def of_model(model: mujoco.MjModel, geoms: np.ndarray) -> Meshes:
         if mesh not in begins:
             begins[mesh] = len(nodes.box)
             first, count = model.mesh_faceadr[mesh], model.mesh_facenum[mesh]
-            corners = model.mesh_vert[model.mesh_vertadr[mesh] + model.mesh_face[first : first + count]]
-            nodes.add(corners)
+            faces = slice(first, first + count)
+            corners = model.mesh_vert[model.mesh_vertadr[mesh] + model.mesh_face[faces]]
+            normals = model.mesh_normal[model.mesh_normaladr[mesh] + model.mesh_facenormal[faces]]
+            nodes.add(np.concatenate([corners, normals], axis=-1))
         root[geom] = begins[mesh]
     return nodes.arrays(root)
 
@@ -73,16 +78,16 @@ class _Nodes:
         self.corners: list[np.ndarray] = []
 
     def add(self, corners: np.ndarray) -> None:
-        """Adds the nodes of triangles [F, 3, 3] (their corners)."""
-        node = len(self.box)
-        self.box.append(np.concatenate([corners.min(axis=(0, 1)), corners.max(axis=(0, 1))]))
+        """Adds the nodes of triangles [F, 3, 6], the positions of their corners and the normals there."""
+        node, place = len(self.box), corners[..., :3]
+        self.box.append(np.concatenate([place.min(axis=(0, 1)), place.max(axis=(0, 1))]))
         self.skip.append(-1)
         if len(corners) <= LEAF:
             self.first.append(LEAF * len(self.corners))
             self.corners.append(np.concatenate([corners, np.repeat(corners[-1:], LEAF - len(corners), axis=0)]))
         else:
             self.first.append(-1)
-            centers = corners.mean(axis=1)
+            centers = place.mean(axis=1)
             half = len(corners) // 2
             order = np.argpartition(centers[:, np.ptp(centers, axis=0).argmax()], half)
             self.add(corners[order[:half]])
@@ -91,9 +96,8 @@ class _Nodes:
 
     def arrays(self, root: np.ndarray) -> Meshes:
         """Makes arrays of all nodes."""
-        a, b, c = np.moveaxis(np.concatenate(self.corners).astype(float), 1, 0)
-        normal = np.cross(b - a, c - a)
-        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+        corners = np.concatenate(self.corners).astype(float)
+        (a, b, c), normal = np.moveaxis(corners[..., :3], 1, 0), corners[..., 3:]
         skip, first = np.array(self.skip, np.int32), np.array(self.first, np.int32)
         return Meshes(np.array(self.box), skip, first, np.stack([a, b - a, c - a], axis=1), normal, root)
 
@@ -111,15 +115,15 @@ def _columns(table: jax.Array) -> Vector:
     return table[:, 0], table[:, 1], table[:, 2]
 
 
-def _meet(triangle: jax.Array, o: Vector, d: Vector) -> jax.Array:
-    """Computes the distances [P] to triangles [P, 3, 3]; infinite for rays that miss them."""
+def _meet(triangle: jax.Array, o: Vector, d: Vector) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Computes the distances [P] to triangles [P, 3, 3], infinite for rays that miss them, and β and γ."""
     a, u, v = (_columns(triangle[:, i]) for i in range(3))
     s, n = tuple(x - y for x, y in zip(o, a, strict=True)), _cross(u, v)
     det = -_dot(d, n)
     inverse = 1 / jnp.where(det != 0, det, 1.0)
     beta, gamma = -_dot(d, _cross(s, v)) * inverse, -_dot(d, _cross(u, s)) * inverse
     hit = (det != 0) & (beta >= 0) & (gamma >= 0) & (beta + gamma <= 1)
-    return jnp.where(hit, _dot(s, n) * inverse, jnp.inf)
+    return jnp.where(hit, _dot(s, n) * inverse, jnp.inf), beta, gamma
 
 
 def meet(
@@ -159,7 +163,7 @@ def meet(
         leaf = first[at] >= 0
         for number in range(LEAF):
             index = jnp.maximum(first[at], 0) + number
-            t = _meet(triangle[index], o, d)
+            t, *_ = _meet(triangle[index], o, d)
             nearer = inside & leaf & (t >= least) & (t < nearest)
             nearest, found = jnp.where(nearer, t, nearest), jnp.where(nearer, index, found)
         after = jnp.where(inside & ~leaf, at + 1, skip[at])
@@ -170,8 +174,23 @@ def meet(
     return nearest, found
 
 
-def normal(meshes: Meshes, triangle: jax.Array, d: Vector) -> Vector:
-    """Returns unit normals of triangles [P], on the side that rays d meet: three [P] arrays in the mesh's frame."""
-    facing = _columns(jnp.asarray(meshes.normal, d[0].dtype)[triangle])
-    side = jnp.where(_dot(facing, d) > 0, -1.0, 1.0)
-    return side * facing[0], side * facing[1], side * facing[2]
+def normal(meshes: Meshes, triangle: jax.Array, o: Vector, d: Vector) -> Vector:
+    """Computes the unit normals of the surface where rays meet triangles, on the side that they meet.
+
+    Args:
+        meshes: the hierarchies.
+        triangle: [P] int32, what `meet` has found.
+        o: three [P] arrays, where the rays start, in the frame of the mesh (m).
+        d: three [P] arrays, their directions.
+
+    Returns:
+        Three [P] arrays in the frame of the mesh; of any finite length where a ray meets nothing.
+    """
+    corners = jnp.asarray(meshes.triangle, d[0].dtype)[triangle]
+    _, beta, gamma = _meet(corners, o, d)
+    at_a, at_b, at_c = (_columns(jnp.asarray(meshes.normal[:, i], d[0].dtype)[triangle]) for i in range(3))
+    smooth = tuple((1 - beta - gamma) * a + beta * b + gamma * c for a, b, c in zip(at_a, at_b, at_c, strict=True))
+    flat = _cross(_columns(corners[:, 1]), _columns(corners[:, 2]))
+    met = jnp.where(_dot(flat, d) > 0, -1.0, 1.0) * jnp.where(_dot(flat, smooth) < 0, -1.0, 1.0)
+    inverse = met * jax.lax.rsqrt(jnp.maximum(_dot(smooth, smooth), _TINY))
+    return inverse * smooth[0], inverse * smooth[1], inverse * smooth[2]

@@ -43,8 +43,9 @@ def at_points(
     if triangles is not None:  # the way from the camera to the point leads to the triangle
         root = jnp.where(kinds == Kind.MESH, jnp.asarray(triangles.root)[geom_id], len(triangles.skip))
         ray = tuple(dot(row[:3], point) for row in rows)
-        _, seen = meshes.meet(triangles, root, tuple(row[3] for row in rows), ray, _SEEN)
-        facing = meshes.normal(triangles, seen, ray)
+        eye = tuple(row[3] for row in rows)
+        _, seen = meshes.meet(triangles, root, eye, ray, _SEEN)
+        facing = meshes.normal(triangles, seen, eye, ray)
     return surface_normal(kinds, rows, maps.stretch[geom_id], point, facing)
 
 

@@ -51,7 +51,7 @@ def ready(text: str) -> tuple[mujoco.MjModel, mujoco.MjData]:
 
 
 def mujoco_rays(model, data):
-    """Casts MuJoCo's rays through all pixels: ids and depths [P], and normals [P, 3]."""
+    """Casts MuJoCo's rays through all pixels: ids and depths [P], normals of triangles and surfaces [P, 3]."""
     half = np.tan(np.deg2rad(46) / 2)
     rows, columns = np.mgrid[:HEIGHT, :WIDTH]
     x = half * WIDTH / HEIGHT * ((columns + 0.5) * 2 / WIDTH - 1)
@@ -63,7 +63,31 @@ def mujoco_rays(model, data):
         along = mujoco.mj_ray(model, data, data.cam_xpos[0], ray, None, True, -1, found, facing)
         geom[i], normal[i] = found[0], facing
         depth[i] = along if along >= 0 else np.inf
-    return geom, depth, normal
+    smooth, point = normal.copy(), data.cam_xpos[0] + np.where(np.isinf(depth), 0, depth)[:, None] * rays
+    for number in np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_MESH):
+        smooth[geom == number] = smooth_normals(model, data, number, point[geom == number], normal[geom == number])
+    return geom, depth, normal, smooth
+
+
+def smooth_normals(model, data, geom, point, normal):
+    """Interpolates MuJoCo's normals at points [P, 3] of a mesh between the corners of the triangles they lie on."""
+    mesh, turn = model.geom_dataid[geom], data.geom_xmat[geom].reshape(3, 3)
+    faces = slice(model.mesh_faceadr[mesh], model.mesh_faceadr[mesh] + model.mesh_facenum[mesh])
+    a, b, c = np.moveaxis(model.mesh_vert[model.mesh_vertadr[mesh] + model.mesh_face[faces]], 1, 0).astype(float)
+    flat = np.cross(b - a, c - a)
+    has_area = np.linalg.norm(flat, axis=1) > 1e-12
+    local = (point - data.geom_xpos[geom]) @ turn
+    matrix = np.stack([b - a, c - a, flat], axis=-1)[has_area]  # p - a = β (b - a) + γ (c - a) + h n
+    beta, gamma, off = np.moveaxis(np.linalg.solve(matrix, (local[:, None] - a[has_area])[..., None])[..., 0], -1, 0)
+    outside = np.maximum(0, np.stack([-beta, -gamma, beta + gamma - 1])).max(axis=0)
+    off = np.abs(off) * np.linalg.norm(flat[has_area], axis=1)
+    nearest = np.where(outside < 1e-4, off, np.inf).argmin(axis=1)
+    at = np.arange(len(local)), nearest
+    weights = np.stack([1 - beta[at] - gamma[at], beta[at], gamma[at]])
+    corners = model.mesh_normal[model.mesh_normaladr[mesh] + model.mesh_facenormal[faces]][has_area][nearest]
+    found = np.einsum("kp,pki->pi", weights, corners) @ turn.T
+    found *= np.where((found * normal).sum(axis=1) < 0, -1, 1)[:, None]
+    return found / np.linalg.norm(found, axis=1, keepdims=True)
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -77,7 +101,7 @@ def test_a_robot_of_meshes_is_where_mujocos_rays_meet_it(seed):
         scenes.append(renderer.scene(data))
         expected.append(mujoco_rays(model, data))
     frames = jax.jit(jax.vmap(renderer.render))(jax.tree.map(lambda *x: jnp.stack(x), *scenes))
-    for number, (geom, depth, normal) in enumerate(expected):
+    for number, (geom, depth, flat, normal) in enumerate(expected):
         frame = jax.device_get(jax.tree.map(lambda x, number=number: x[number], frames))
         same = frame.geom_id.ravel() == geom
         on_mesh = same & (model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH) & (geom >= 0)
@@ -87,6 +111,7 @@ def test_a_robot_of_meshes_is_where_mujocos_rays_meet_it(seed):
         lit = np.maximum(normal @ TO_LIGHTS.T, 0)
         wrong = np.abs(frame.color.reshape(-1, 3) - lit).max(axis=-1) > 5e-3
         assert wrong[on_mesh].mean() <= 0.01  # the edge of a triangle may show the neighboring one
+        assert (np.abs(normal - flat).max(axis=-1) > 0.05)[on_mesh].mean() > 0.2, "surfaces are smooth"
 
 
 @pytest.mark.parametrize("least", [0.0, 0.9])
@@ -95,9 +120,10 @@ def test_rays_find_the_nearest_of_all_triangles(least):
     rng = np.random.default_rng(0)
     corners = rng.uniform(-1, 1, (201, 1, 3)) + rng.uniform(-0.5, 0.5, (201, 3, 3))
     nodes = meshes._Nodes()
-    nodes.add(corners[:60])
+    normals = np.zeros_like(corners)
+    nodes.add(np.concatenate([corners[:60], normals[:60]], axis=-1))
     second = len(nodes.box)
-    nodes.add(corners[60:])
+    nodes.add(np.concatenate([corners[60:], normals[60:]], axis=-1))
     tables = nodes.arrays(np.array([0, second], np.int32))
     find = jax.jit(functools.partial(meshes.meet, tables, least=least))
     o = rng.normal(size=(300, 3))
@@ -148,7 +174,7 @@ def test_a_ball_of_triangles_is_lit_as_a_ball_and_shades_only_what_lies_behind_i
     assert seen.mean() > 0.1
     np.testing.assert_allclose(np.linalg.norm(point[seen], axis=-1), radius, rtol=0.02)
     lit = np.maximum(point[seen] @ to_light / radius, 0)
-    np.testing.assert_allclose(frame.color[seen][:, 0], lit, atol=0.08)
+    np.testing.assert_allclose(frame.color[seen][:, 0], lit, atol=0.004)
     ground = frame.geom_id == 1
     aside = np.linalg.norm(np.cross(point[ground], to_light), axis=-1) / radius  # from the ray through the middle
     np.testing.assert_allclose(frame.color[ground][aside < 0.97][:, 0], 0.0, atol=1e-6)
