@@ -131,6 +131,29 @@ def test_success_needs_an_open_hand_and_a_thing_that_lies_still_on_the_mat(env, 
     assert not judged(place, 0.04, speed=-1.1 * grasp.STILL)
 
 
+def test_the_hand_moves_as_its_controls_say_and_returns_to_its_path(env, tasks, starts):
+    """Drives it in C MuJoCo: velocities after twelve time constants of the servos, and an error that falls to 1/e."""
+    task, start = first(tasks), first(starts)
+    model, steering = c_model(env, task), env.steering
+    data = mujoco.MjData(model)
+    data.qpos[:] = start.qpos
+    velocity = np.array([0.05, -0.1, 0.05, 1.0])
+    controls = np.append(velocity / np.array([grasp.MAX_SPEED] * 3 + [grasp.MAX_TURN]), 0.0)
+    data.ctrl[:] = steering.action(start, jnp.asarray(controls))
+    mujoco.mj_step(model, data, nstep=30)
+    np.testing.assert_allclose(data.qvel[:4], velocity, rtol=0.02)
+    assert data.qpos[4] > grasp.OPEN, "the fingers are open at 0"
+    away = np.array([0.02, -0.01, 0.01, 0.1])
+    expected = dataclasses.replace(start, qpos=jnp.asarray(data.qpos) + jnp.pad(away, (0, env.mj_model.nq - 4)))
+    data.qvel[:4] = 0
+    for _ in range(20):
+        state = dataclasses.replace(start, qpos=jnp.asarray(data.qpos))
+        data.ctrl[:] = steering.action(state, steering.correction(state, expected))
+        mujoco.mj_step(model, data)
+    left = (np.asarray(expected.qpos) - data.qpos)[:4] / away
+    np.testing.assert_allclose(left, np.exp(-0.2 * grasp.TRACKING), atol=0.06)
+
+
 def test_the_cost_is_what_its_weights_say(env, tasks, starts):
     """Compares with distances by NumPy, early and late, far from the mat and on it; its derivatives are finite."""
     task, state, action = first(tasks), first(starts), jnp.linspace(-1, 1, 5)
