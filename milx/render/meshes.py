@@ -14,8 +14,9 @@ A ray o + t d meets a triangle a, a + u, a + v if
 (Möller & Trumbore, "Fast, minimum storage ray-triangle intersection", 1997). Meshes of robots have some triangles the
 wrong way around, so both sides count, as for `mj_ray`. A camera inside a mesh sees its inside.
 
-The surface faces in the direction (1 - β - γ) n_a + β n_b + γ n_c of MuJoCo's normals at the corners, as in its own
-renderer: where these are those of the triangle, its edges are sharp, and elsewhere the mesh looks smooth.
+The surface faces in the direction (1 - β - γ) n_a + β n_b + γ n_c of MuJoCo's normals at the corners. Where these are
+n, the triangle's edges are sharp, and elsewhere the mesh looks smooth. A corner whose normal lies nearly in the
+triangle, as MuJoCo's do where two sheets lie back to back, has n instead.
 """
 
 from typing import NamedTuple
@@ -29,6 +30,7 @@ Vector = tuple[jax.Array, ...]
 LEAF = 2
 """Triangles of a leaf."""
 _TINY = 1e-12
+_IN_PLANE = 0.1
 
 
 class Meshes(NamedTuple):
@@ -98,6 +100,10 @@ class _Nodes:
         """Makes arrays of all nodes."""
         corners = np.concatenate(self.corners).astype(float)
         (a, b, c), normal = np.moveaxis(corners[..., :3], 1, 0), corners[..., 3:]
+        flat = np.cross(b - a, c - a)
+        flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-30)
+        along = np.abs(np.einsum("fi,fci->fc", flat, normal))[..., None] < _IN_PLANE
+        normal = np.where(along, flat[:, None], normal)
         skip, first = np.array(self.skip, np.int32), np.array(self.first, np.int32)
         return Meshes(np.array(self.box), skip, first, np.stack([a, b - a, c - a], axis=1), normal, root)
 
@@ -189,6 +195,8 @@ def normal(meshes: Meshes, triangle: jax.Array, o: Vector, d: Vector) -> Vector:
     corners = jnp.asarray(meshes.triangle, d[0].dtype)[triangle]
     _, beta, gamma = _meet(corners, o, d)
     at_a, at_b, at_c = (_columns(jnp.asarray(meshes.normal[:, i], d[0].dtype)[triangle]) for i in range(3))
+    beta = jnp.clip(beta, 0.0, 1.0)  # they are, but where nothing is met
+    gamma = jnp.clip(gamma, 0.0, 1 - beta)
     smooth = tuple((1 - beta - gamma) * a + beta * b + gamma * c for a, b, c in zip(at_a, at_b, at_c, strict=True))
     flat = _cross(_columns(corners[:, 1]), _columns(corners[:, 2]))
     met = jnp.where(_dot(flat, d) > 0, -1.0, 1.0) * jnp.where(_dot(flat, smooth) < 0, -1.0, 1.0)

@@ -65,9 +65,9 @@ class Renderer:
     """Renders one camera of a model; pure functions to be used under `jax.jit` and `jax.vmap`.
 
     All geoms in groups 0 to 2 are rendered, as MuJoCo does by default. Near and far planes are MuJoCo's
-    (`visual/map/znear` and `zfar`, in units of the model's extent). Meshes have the flat normals of their triangles;
-    MuJoCo's textures are not drawn. The color is differentiable with respect to the colors and the lights; the geometry
-    carries no gradient.
+    (`visual/map/znear` and `zfar`, in units of the model's extent). Meshes have MuJoCo's normals at their corners,
+    interpolated; MuJoCo's textures are not drawn. The color is differentiable with respect to the colors and the
+    lights; the geometry carries no gradient.
     """
 
     def __init__(
