@@ -61,6 +61,7 @@ _PACKAGES = (
     "types",
     "worlds",
 )
+"""Packages and modules that are attributes of milx without an import of their own."""
 
 
 def __getattr__(name: str) -> Any:

@@ -31,6 +31,7 @@ LEAF = 2
 """Triangles of a leaf."""
 _TINY = 1e-12
 _IN_PLANE = 0.1
+"""A corner's normal lies nearly in its triangle if the cosine of its angle to n is smaller."""
 
 
 class Meshes(NamedTuple):
@@ -195,7 +196,7 @@ def normal(meshes: Meshes, triangle: jax.Array, o: Vector, d: Vector) -> Vector:
     corners = jnp.asarray(meshes.triangle, d[0].dtype)[triangle]
     _, beta, gamma = _meet(corners, o, d)
     at_a, at_b, at_c = (_columns(jnp.asarray(meshes.normal[:, i], d[0].dtype)[triangle]) for i in range(3))
-    beta = jnp.clip(beta, 0.0, 1.0)  # they are, but where nothing is met
+    beta = jnp.clip(beta, 0.0, 1.0)  # β and γ are outside of these limits only where nothing is met
     gamma = jnp.clip(gamma, 0.0, 1 - beta)
     smooth = tuple((1 - beta - gamma) * a + beta * b + gamma * c for a, b, c in zip(at_a, at_b, at_c, strict=True))
     flat = _cross(_columns(corners[:, 1]), _columns(corners[:, 2]))

@@ -160,7 +160,7 @@ class Grasp(Env[GraspTask]):
 
     @property
     def steering(self) -> Steering:
-        """The actions [5], but that the fingers are open at 0; the hand returns to where it is expected."""
+        """The actions [5], where 0 opens the fingers; the hand returns to where it is expected."""
         scale = jnp.array([MAX_SPEED] * 3 + [MAX_TURN])
         opened, deviation = jnp.array([0, 0, 0, 0, -0.6]), jnp.array([0.3, 0.3, 0.3, 0.3, 0.6])
 
