@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from milx.core.mjx import mjx
 from milx.envs.grasp import env as grasp
 from milx.envs.grasp.env import Grasp
 from milx.envs.shapes import BY_SPLIT, SHAPES
@@ -227,3 +228,35 @@ def test_mats_lie_on_the_shelf_with_their_whole_outlines(env, tasks, starts):
             np.testing.assert_allclose(tops, grasp.SHELF + grasp.MAT_HEIGHT, atol=1e-9)
             reach = np.abs(ends - shelf.pos)[:, :2] + np.concatenate([radius, radius])
             assert (reach <= shelf.size[:2]).all()
+
+
+def test_textures_turn_with_the_thing_and_the_mats(env, tasks, starts):
+    task, start = first(tasks), first(starts)
+    data = mujoco.MjData(env.mj_model)
+    data.qpos[:], data.mocap_pos[:] = start.qpos, start.mocap_pos
+    mujoco.mj_kinematics(env.mj_model, data)
+    textures = env.textures(task, mjx.put_data(env.mj_model, data))
+    local = np.array([0.02, -0.01, 0.03])
+    for name, own in zip(("thing", "mat_0", "mat_1", "mat_2"), task.texture.frame, strict=True):
+        body = data.body(name)
+        place = body.xpos + body.xmat.reshape(3, 3) @ local
+        geoms = np.flatnonzero(env.mj_model.geom_bodyid == env.mj_model.body(name).id)
+        for geom in geoms:
+            np.testing.assert_allclose(textures.frame[geom] @ np.append(place, 1), own @ np.append(local, 1), atol=1e-4)
+    assert not textures.family[env.mj_model.geom("shelf").id], "all else is plain"
+
+
+def test_calibration_tells_where_in_the_image_a_mat_lies(tasks, starts):
+    """Finds the target's pixels by drawing it in another color; their center is where the calibration puts it."""
+    env, task, start = Grasp((90, 100)), first(tasks), first(starts)
+    task = dataclasses.replace(task, target=jnp.int32(0), texture=task.texture._replace(family=jnp.zeros(4, jnp.int32)))
+    looks = [dataclasses.replace(task, color=task.color.at[1].set(level)) for level in (0.1, 0.9)]
+    render, errors = jax.jit(env.render), []
+    for spot in np.random.default_rng(0).uniform(grasp.MATS_LOW, grasp.MATS_HIGH, (8, 2)):
+        away = jnp.array([[*spot, grasp.SHELF], [2.0, 1.0, 0.0], [2.0, -1.0, 0.0]])
+        dark, light = (np.asarray(render(look, dataclasses.replace(start, mocap_pos=away)), int) for look in looks)
+        rows, cols = np.nonzero(np.abs(light - dark).max(axis=-1) > 40)
+        center = np.array([(2 * cols.mean() + 1) / 100 - 1, (2 * rows.mean() + 1) / 90 - 1, 1.0])
+        errors.append(np.linalg.norm(center @ env.image_to_goal - spot))
+    # A pixel is about 7 mm; the camera looks down at an angle, which an affine map fits over the shelf.
+    assert max(errors) < 0.02
