@@ -3,9 +3,10 @@
     python experiments/planning/demonstrate.py                                # 9,216 scenes of push, on a GPU
     python experiments/planning/demonstrate.py --envs=reach --envs=place --scenes=512 --batch=128
     python experiments/planning/demonstrate.py --envs=place --scenes=64 --batch=64    # on two cores
+    python experiments/planning/demonstrate.py --envs=grasp --expert=receding --scenes=512
 
-Planned as a run with `data.expert = "sampling"` plans (`milx.data.experts`). The plans with which all scenes begin are
-searched for first, in 512 other scenes. Nothing comes from a cache. No setting was chosen by these scenes.
+Planned as a run with `data.expert` plans (`milx.data.experts`). With "sampling" the plans with which all scenes begin
+are searched for first, in 512 other scenes. Nothing comes from a cache. No setting was chosen by these scenes.
 """
 
 import dataclasses
@@ -31,10 +32,11 @@ from milx.envs.base import Env
 from milx.envs.push.presets import PUSH
 from milx.evaluation import provenance
 from milx.evaluation.intervals import wilson_interval
+from milx.trajopt.expert import Sampling
 
 FIRST_SEED = 1000
 """Of the scenes; push.py and the trials by which settings were chosen have smaller ones."""
-ITERATIONS = 8
+ITERATIONS = {"sampling": 8, "receding": 1}
 
 # Not one of milx's environments until its experts succeed often enough.
 register_env_at("grasp", "milx.envs.grasp.env:Grasp", {"fast": PUSH["fast"] | {"env.image_shape": (90, 100)}})
@@ -43,14 +45,15 @@ register_env_at("grasp", "milx.envs.grasp.env:Grasp", {"fast": PUSH["fast"] | {"
 def measure(env: Env, config: DataConfig, scenes: int) -> Iterator[dict[str, Any]]:
     """Plans and executes `scenes` scenes, rounded up to whole batches, and yields what is known after each batch."""
     began, batch = time.perf_counter(), config.plan_batch
-    plans = experts.expert_of(env, config).plans
+    expert = experts.expert_of(env, config)
+    plans = {"plans_to_begin_with": int(expert.plans.success.sum())} if isinstance(expert, Sampling) else {}
     first, counts = time.perf_counter() - began, []
     for number in range(-(-scenes // batch)):
         demos = collect(env, jax.random.key(FIRST_SEED + number), "train", batch, 1, config)
         counts.append(int(demos.success.sum()))
         made, total = batch * len(counts), time.perf_counter() - began
         yield {
-            "plans_to_begin_with": int(plans.success.sum()),
+            **plans,
             "scenes": made,
             "success": sum(counts) / made,
             "wilson95": wilson_interval(sum(counts), made),
@@ -70,13 +73,16 @@ def main(_: list[str]) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for name in _ENVS.value:
         config = make_config(name, preset="fast").data
-        changes = {"expert": "sampling", "plan_iterations": ITERATIONS, "plan_batch": _BATCH.value}
+        expert = _EXPERT.value
+        changes = {"expert": expert, "plan_iterations": ITERATIONS[expert], "plan_batch": _BATCH.value}
         config = dataclasses.replace(config, **changes)
-        settings = dataclasses.asdict(experts.SETTINGS) | {"first_seed": FIRST_SEED}
+        settings = {"sampling": experts.SETTINGS, "receding": experts.RECEDING}[expert]
+        settings = dataclasses.asdict(settings) | {"first_seed": FIRST_SEED}
         for found in measure(envs.make(name, (16, 16)), config, _SCENES.value):
             said = {"env": name, "data": dataclasses.asdict(config), "settings": settings}
             result = {**said, **found, **provenance.origin()}
-            files.write_json(folder / f"demonstrations-{name}.json", result)
+            file = f"demonstrations-{name}.json" if expert == "sampling" else f"demonstrations-{name}-{expert}.json"
+            files.write_json(folder / file, result)
             (low, high), newest = found["wilson95"], found["success_by_batch"][-1]
             total = found["seconds"]["total, with compilation"]
             print(
@@ -88,6 +94,7 @@ def main(_: list[str]) -> None:
 
 if __name__ == "__main__":
     _ENVS = flags.DEFINE_multi_enum("envs", ["push"], list(envs.ENVS), "Which environments (repeat the flag).")
+    _EXPERT = flags.DEFINE_enum("expert", "sampling", list(ITERATIONS), "Who demonstrates.")
     _SCENES = flags.DEFINE_integer("scenes", 9216, "Scenes, each of another task.", lower_bound=1)
     _BATCH = flags.DEFINE_integer("batch", 512, "Scenes at once.", lower_bound=1)
     _OUT = flags.DEFINE_string("out", "experiments/results/planning", "Folder of the JSON files.")

@@ -47,12 +47,12 @@ class DataConfig:
         demos_per_task: demonstrations of each training task, in different scenes.
         noise: standard deviation of the Gaussian noise on the expert's actions, in units of the action.
         spare_demos: additional demonstrations of each validation and test task, so that failed ones can be replaced.
-        expert: how demonstrations are planned: "ilqr", or "sampling", which needs no derivatives and no controller
-            (`milx.trajopt.planner`).
+        expert: how demonstrations are planned: "ilqr"; or without derivatives or a controller, "sampling" whole
+            episodes (`milx.trajopt.planner`), or "receding", the next time steps (`milx.trajopt.receding`).
         plan_iterations: iterations of trajectory optimization for a demonstration: with "ilqr" their maximum number, or
             0 to use the environment's controller instead; with "sampling" their number, 8 in the results that are
-            reported.
-        plan_batch: demonstrations planned at once; with "sampling" each of them rolls out 64 plans at once.
+            reported; with "receding" their number in each of many plans, for which 1 is enough.
+        plan_batch: demonstrations planned at once; by sampling each of them rolls out 64 plans at once.
     """
 
     tasks: int = 1500

@@ -13,17 +13,19 @@ from milx.config.schema import DataConfig
 from milx.core import platform, pytrees
 from milx.core.messages import warn
 from milx.envs.base import Env
-from milx.trajopt import expert
+from milx.trajopt import expert, receding
 from milx.trajopt.expert import Sampling
 from milx.trajopt.ilqr import Options
 from milx.trajopt.planner import Plans, Settings, find_plans, share_plans
 
-EXPERTS = ("ilqr", "sampling")
+EXPERTS = ("ilqr", "sampling", "receding")
 SETTINGS = Settings()
-"""Of experts by sampling."""
+"""Of experts that plan whole episodes by sampling."""
+RECEDING = receding.Settings()
+"""Of experts by sampling with a receding horizon."""
 
 
-def expert_of(env: Env, config: DataConfig) -> Options | Sampling:
+def expert_of(env: Env, config: DataConfig) -> Options | Sampling | receding.Settings:
     """Returns the expert that a run's settings ask for.
 
     The first expert by sampling of an environment searches for plans with which others begin, under the same noise, and
@@ -39,15 +41,21 @@ def expert_of(env: Env, config: DataConfig) -> Options | Sampling:
     if config.expert == "ilqr":
         return Options(iterations=config.plan_iterations)
     if config.plan_iterations < 1:
-        raise ValueError(f"data.plan_iterations: got {config.plan_iterations}, expected at least 1 with sampling")
+        raise ValueError(
+            f"data.plan_iterations: got {config.plan_iterations}, expected at least 1 with {config.expert}"
+        )
+    if config.expert == "receding":
+        search = dataclasses.replace(RECEDING.search, iterations=config.plan_iterations)
+        return dataclasses.replace(RECEDING, search=search)
     search = dataclasses.replace(SETTINGS.search, iterations=config.plan_iterations)
     return Sampling(dataclasses.replace(SETTINGS, search=search), _plans(env, SETTINGS, config.noise))
 
 
 def description(config: DataConfig) -> list:
     """Lists what decides, beside versions, what an expert plans."""
-    sampling = [] if config.expert == "ilqr" else [config.expert, repr(SETTINGS)]
-    return [config.noise, config.plan_iterations, *sampling]
+    by_sampling = {"sampling": SETTINGS, "receding": RECEDING}
+    settings = [config.expert, repr(by_sampling[config.expert])] if config.expert in by_sampling else []
+    return [config.noise, config.plan_iterations, *settings]
 
 
 def digest(env: Env, *request: Any) -> str:

@@ -52,6 +52,12 @@ def with_controls(
     )
 
 
+def approximated(problem: Problem) -> Problem:
+    """States a problem in the approximate dynamics that it has."""
+    assert problem.approximation is not None, "every environment has one"
+    return problem._replace(dynamics=problem.approximation)
+
+
 def steered(env: Env, task: Task, state: State) -> Problem:
     """States the problem of an episode in the controls of the environment's steering."""
     steering = env.steering

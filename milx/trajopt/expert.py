@@ -3,7 +3,8 @@
 The noise drives the arm off the plan and the recorded action is the feedback's answer, before the noise: a
 demonstration so shows how to recover, and its labels are clean (DART, Laskey et al. 2017). Where iLQR does not plan
 (no iterations) the feedback is the environment's controller, with a tactic that a rehearsal without noise chooses. An
-expert by sampling (`planner.py`) does the same with its own plans and its own way to follow them.
+expert by sampling (`planner.py`) does the same with its own plans and its own way to follow them, and one with a
+receding horizon (`receding.py`) plans again where the noise has driven it.
 """
 
 import functools
@@ -17,7 +18,7 @@ import numpy as np
 from milx.core import parallel
 from milx.core.batching import map_in_chunks
 from milx.envs.base import Env, State, Task
-from milx.trajopt import planner
+from milx.trajopt import planner, receding
 from milx.trajopt.episode import problem_of
 from milx.trajopt.ilqr import Options, Plan, solve
 from milx.trajopt.planner import Plans, Settings
@@ -87,11 +88,11 @@ def perform(
     task: Task,
     state: State,
     key: jax.Array,
-    options: Options | Sampling,
+    options: Options | Sampling | receding.Settings,
     noise: float,
     tactic: np.ndarray | None = None,
 ) -> tuple[State, jax.Array]:
-    """Demonstrates a batch, as planned by iLQR or by sampling, or by the environment's controller.
+    """Demonstrates a batch, by plans of whole episodes, with a receding horizon, or by the environment's controller.
 
     Not to be called inside `jax.jit`.
 
@@ -100,7 +101,7 @@ def perform(
         task: [N] what is to be done.
         state: [N] the scenes.
         key: [N] draw the noise.
-        options: of iLQR, with no iterations of which the controller acts, or of the expert by sampling.
+        options: of iLQR, with no iterations of which the controller acts, or of an expert by sampling.
         noise: standard deviation of the noise, in units of the action.
         tactic: [N], the tactics of the controller; None for those that `choose_tactics` finds.
 
@@ -110,6 +111,8 @@ def perform(
     Raises:
         ValueError: for no iterations in an environment without a controller.
     """
+    if isinstance(options, receding.Settings):
+        return receding.demonstrate(env, options, noise, task, state, key)
     if isinstance(options, Sampling):
         return planner.demonstrate(env, options.settings, options.plans, noise, task, state, key)
     if options.iterations:

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 from milx.core import parallel
 from milx.envs.base import Env, State, Task
 from milx.trajopt import replanning, sampling
-from milx.trajopt.episode import steered
+from milx.trajopt.episode import approximated, steered
 from milx.trajopt.ilqr import Problem
 from milx.trajopt.sampling import Options, Search
 
@@ -103,9 +103,7 @@ class Planner:
 
     def problem(self, task: Task, start: State) -> Problem:
         """States what is planned: the environment's costs, by its steering, in its approximate dynamics."""
-        problem = steered(self.env, task, start)
-        assert problem.approximation is not None  # every environment has one
-        return problem._replace(dynamics=problem.approximation)
+        return approximated(steered(self.env, task, start))
 
     def features(self, task: Task, start: State) -> jax.Array:
         """Describes a scene by the running residual [R] of its first state, without an action."""

@@ -23,7 +23,7 @@ def control(
     every: int,
     key: jax.Array,
     options: Options,
-    plant: Callable[[jax.Array, jax.Array, jax.Array], jax.Array] | None = None,
+    plant: Callable[[jax.Array, jax.Array, jax.Array], tuple[jax.Array, jax.Array]] | None = None,
 ) -> tuple[jax.Array, jax.Array]:
     """Executes the first actions of a plan, plans again from where they lead, and so on (receding horizon).
 
@@ -39,10 +39,11 @@ def control(
         every: time steps from one plan to the next.
         key: draws candidates, and what `plant` draws.
         options: settings.
-        plant: (x [n], u [m], key) -> next x [n], what happens; the problem's dynamics by default.
+        plant: (x [n], u [m], key) -> next x [n] and what was done [a], what happens; by default the problem's dynamics,
+            and u.
 
     Returns:
-        States [S + 1, n] and actions [S, m].
+        States [S + 1, n] and what was done [S, a].
 
     Raises:
         ValueError: if `steps` is not a multiple of `every`, or `every` is more than the horizon; if knots are held
@@ -54,15 +55,15 @@ def control(
     if options.order == 0 and every * knots % horizon:
         held = f"{horizon / knots:g} time steps, for which a knot is held"
         raise ValueError(f"every: got {every}, expected a multiple of {held}")
-    happens = plant or (lambda x, u, key: problem.dynamics(x, u))
+    happens = plant or (lambda x, u, key: (problem.dynamics(x, u), u))
     later = knot_times(options.order, horizon, knots) + every
     search = jax.tree.map(lambda x: x.astype(initial_state.dtype), search)
     moved = jnp.asarray(basis(options.order, later, horizon, knots), initial_state.dtype)
 
     def act(x: jax.Array, inputs: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
         u, key = inputs
-        after = happens(x, u, key)
-        return after, (after, u)
+        after, done = happens(x, u, key)
+        return after, (after, done)
 
     def replan(carry, inputs):
         x, plan, best = carry
@@ -76,9 +77,9 @@ def control(
 
     times = jnp.arange(0, steps, every, dtype=jnp.int32)
     inputs = times, jax.random.split(key, len(times))
-    _, (states, actions) = lax.scan(replan, (initial_state, search.knots, search.best), inputs)
+    _, (states, done) = lax.scan(replan, (initial_state, search.knots, search.best), inputs)
     states = jnp.concatenate([initial_state[None], states.reshape(steps, -1)])
-    return states, actions.reshape(steps, -1)
+    return states, done.reshape(steps, -1)
 
 
 def execute(

@@ -11,6 +11,7 @@ from milx.config.assemble import make_config
 from milx.config.schema import DataConfig
 from milx.data import experts
 from milx.data.simulated import collect
+from milx.trajopt import receding
 from milx.trajopt.ilqr import Options
 from milx.trajopt.planner import Plans, Settings
 
@@ -25,10 +26,14 @@ def env():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"expert": "mppi"}, "data.expert: got 'mppi', expected one of ilqr, sampling"),
+        ({"expert": "mppi"}, "data.expert: got 'mppi', expected one of ilqr, sampling, receding"),
         (
             {"expert": "sampling", "plan_iterations": 0},
             "data.plan_iterations: got 0, expected at least 1 with sampling",
+        ),
+        (
+            {"expert": "receding", "plan_iterations": 0},
+            "data.plan_iterations: got 0, expected at least 1 with receding",
         ),
     ],
 )
@@ -42,10 +47,15 @@ def test_ilqr_has_the_iterations_of_the_settings(env):
     assert experts.description(DataConfig(noise=0.2, plan_iterations=7)) == [0.2, 7]
 
 
+def test_a_receding_horizon_has_the_iterations_of_the_settings(env):
+    expert = experts.expert_of(env, DataConfig(expert="receding", plan_iterations=3))
+    assert expert == receding.Settings(search=dataclasses.replace(receding.SEARCH, iterations=3))
+
+
 def test_all_that_decides_on_demonstrations_by_sampling_describes_them(monkeypatch):
     config = DataConfig(expert="sampling", plan_iterations=4)
     described = [experts.description(config)]
-    for changes in ({"expert": "ilqr"}, {"noise": 0.3}, {"plan_iterations": 5}):
+    for changes in ({"expert": "ilqr"}, {"expert": "receding"}, {"noise": 0.3}, {"plan_iterations": 5}):
         described.append(experts.description(dataclasses.replace(config, **changes)))
     monkeypatch.setattr(experts, "SETTINGS", FEW)
     described.append(experts.description(config))
@@ -97,10 +107,11 @@ def test_plans_are_found_once_and_kept(env, tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.slow
-def test_place_is_demonstrated_by_sampling(env, monkeypatch):
+@pytest.mark.parametrize(("expert", "iterations"), [("sampling", 4), ("receding", 1)])
+def test_place_is_demonstrated_by_sampling(env, monkeypatch, expert, iterations):
     """The preset's noise; iLQR succeeds in 99% of the demonstrations, and a random container in a third."""
     monkeypatch.setattr(experts, "SETTINGS", FEW)
-    settings = {"expert": "sampling", "plan_iterations": 4, "plan_batch": 24}
+    settings = {"expert": expert, "plan_iterations": iterations, "plan_batch": 24}
     config = dataclasses.replace(make_config("place", preset="fast").data, **settings)
     demos = collect(env, jax.random.key(3), "validation", 12, 2, config)
     assert float(demos.success.mean()) >= 0.8

@@ -156,18 +156,23 @@ def test_the_hand_moves_as_its_controls_say_and_returns_to_its_path(env, tasks, 
 
 
 def test_the_cost_is_what_its_weights_say(env, tasks, starts):
-    """Compares with distances by NumPy, early and late, far from the mat and on it; its derivatives are finite."""
+    """Compares with NumPy, early and late, far from the mat and on it, tilted and moving; derivatives are finite."""
     task, state, action = first(tasks), first(starts), jnp.linspace(-1, 1, 5)
     for place in (state.qpos[6:9], state.mocap_pos[task.target] + jnp.array([0.03, 0.04, 0.1])):
-        for t in (0, env.horizon - 1):
-            qpos = state.qpos.at[6:9].set(place).at[4].set(0.01)
+        for t in (0, env.horizon - grasp.LET_GO, env.horizon - grasp.LEAVE, env.horizon - 1):
+            qpos = state.qpos.at[6:9].set(place).at[4].set(0.01).at[9:13].set(np.array([0.5, 0.1, -0.7, 0.5]))
+            qvel = jnp.linspace(-0.5, 0.5, 12)
             off = np.asarray(place - state.mocap_pos[task.target] - jnp.array([0, 0, env.resting(task)]))
             away = np.hypot(*off[:2])
             carried = np.interp(away, (grasp.NEAR, grasp.FAR), (0.0, grasp.CARRIED))
             opened = grasp.OPEN_COST * (0.045 - 0.01) * (t >= env.horizon - grasp.LET_GO)
             expected = [*grasp.THING_COST * off[:2], grasp.HEIGHT_COST * (off[2] - carried), opened]
-            expected += [*grasp.HAND_COST * np.asarray(qpos[:3] - place), *0.02 * np.asarray(action)]
-            at = dataclasses.replace(state, qpos=qpos)
+            leaving = t >= env.horizon - grasp.LEAVE
+            over = np.array([0, 0, grasp.RETREAT * leaving])
+            expected += [*grasp.HAND_COST * (np.asarray(qpos[:3] - place) - over), 0.1, -0.7]
+            expected += [*leaving * np.asarray(qvel[6:9]), *0.03 * leaving * np.asarray(qvel[9:])]
+            expected += [*0.02 * np.asarray(action)]
+            at = dataclasses.replace(state, qpos=qpos, qvel=qvel)
             np.testing.assert_allclose(env.running_residual(task, at, action, t), expected, atol=5e-5)
     slope = jax.jacfwd(lambda qpos: env.running_residual(task, dataclasses.replace(state, qpos=qpos), action, 0))
     on_mat = state.qpos.at[6:9].set(state.mocap_pos[task.target])

@@ -25,11 +25,11 @@ def test_planning_again_costs_less_where_things_turn_out_otherwise():
     first = sampling.start(jnp.zeros((12, 2)), 1.0)
 
     def plant(x, u, key):
-        return problem.dynamics(x, u) + 0.3 * jax.random.normal(key, x.shape)
+        return problem.dynamics(x, u) + 0.3 * jax.random.normal(key, x.shape), u
 
     draws = jax.jit(
         lambda key: replanning.control(
-            problem, state, first, 12, 6, 2, key, options, lambda x, u, key: x + jax.random.normal(key, x.shape)
+            problem, state, first, 12, 6, 2, key, options, lambda x, u, key: (x + jax.random.normal(key, x.shape), u)
         )
     )
     noise = np.diff(draws(jax.random.key(0))[0], axis=0)

@@ -41,18 +41,23 @@ SUNK, ROLLING = 0.004, 2e-4
 ON_MAT, RESTING, STILL, OPEN = 0.05, 0.008, 0.05, 0.025
 """What success allows: distances from the mat's center and from the height at which things rest (m), speed (m/s), and
 the least opening of a finger (m)."""
-LET_GO = 10
-"""The hand opens in this number of steps at the end of the episode."""
+LET_GO, LEAVE = 15, 11
+"""In this number of steps at the end of the episode the hand is to open, and to leave a thing that lies still."""
 THING_COST, HEIGHT_COST, HAND_COST, OPEN_COST = 3.0, 15.0, 3.0, 10.0
 """Weights of the residuals (1/m)."""
+SPEED_COST, SPIN_COST, TILT_COST = 1.0, 0.03, 1.0
+"""Weights of the thing's velocity (s/m) and turning (s/rad), and of the sine of half the angle by which it tilts."""
 CARRIED, NEAR, FAR = 0.07, 0.024, 0.104
 """How high over its place the thing is to be carried where it is farther away than FAR as seen from above (m); nearer
 it is to come down, and to lie where it is nearer than NEAR."""
+RETREAT = 0.06
+"""How high over the thing the hand is to leave it (m)."""
 MAX_SPEED, MAX_TURN = 0.5, 3.0
 """What an action of 1 asks of the hand: m/s and rad/s."""
 TRACKING = 6.0
 """Rate at which the hand returns to its path (1/s)."""
 _HAND, _FINGER, _THING = slice(0, 4), 4, slice(6, 9)  # entries of qpos, and of qvel
+_TILT, _MOTION = slice(10, 12), slice(6, 12)  # entries of qpos, and of qvel
 _CANDIDATES = 256
 _GRAIN = 1e-3
 
@@ -96,6 +101,7 @@ class Grasp(Env[GraspTask]):
     camera = "front"
     criterion = f"at the end the thing lies still within {ON_MAT} m of the target mat's center and the hand is open"
     goal_indices = (0, 1)
+    ahead = 20
     action_cost = 0.02
 
     def __init__(self, image_shape: tuple[int, int] | None = None):
@@ -217,17 +223,20 @@ class Grasp(Env[GraspTask]):
         return state.qpos[_THING] - state.mocap_pos[task.target].at[2].add(self.resting(task))
 
     def running_residual(self, task: GraspTask, state: State, action: jax.Array, t: jax.Array) -> jax.Array:
-        """Returns [12]: how far the thing, the hand and, at the end, the fingers are off, and the action, weighted.
+        """Returns [20]: how far thing, hand and, at the end, fingers are off; tilt, final speed and action; weighted.
 
         The thing's height is compared with that at which it is to be carried, which falls to 0 near the mat.
         """
         *across, up = self.off_target(task, state)
         away = jnp.linalg.norm(jnp.stack(across) + 1e-6)
         carried = CARRIED * jnp.clip((away - NEAR) / (FAR - NEAR), 0.0, 1.0)
-        hand = state.qpos[:3] - state.qpos[_THING]
-        closed = jnp.where(t >= self.horizon - LET_GO, self.mj_model.jnt_range[_FINGER, 1] - state.qpos[_FINGER], 0.0)
+        open_now, leave_now = t >= self.horizon - LET_GO, t >= self.horizon - LEAVE
+        hand = (state.qpos[:3] - state.qpos[_THING]).at[2].add(jnp.where(leave_now, -RETREAT, 0.0))
+        closed = jnp.where(open_now, self.mj_model.jnt_range[_FINGER, 1] - state.qpos[_FINGER], 0.0)
         off = [THING_COST * x for x in across] + [HEIGHT_COST * (up - carried), OPEN_COST * closed]
-        return jnp.concatenate([jnp.stack(off), HAND_COST * hand, self.action_cost * action])
+        moving = jnp.where(leave_now, jnp.array([SPEED_COST] * 3 + [SPIN_COST] * 3), 0.0) * state.qvel[_MOTION]
+        tilt = TILT_COST * state.qpos[_TILT]
+        return jnp.concatenate([jnp.stack(off), HAND_COST * hand, tilt, moving, self.action_cost * action])
 
     def success(self, task: GraspTask, states: State) -> jax.Array:
         """Tells whether the thing lies still on the target mat at the end, and the hand is open."""
