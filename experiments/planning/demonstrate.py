@@ -5,7 +5,7 @@
     python experiments/planning/demonstrate.py --envs=place --scenes=64 --batch=64    # on two cores
     python experiments/planning/demonstrate.py --envs=grasp --expert=receding --scenes=512
 
-Planned as a run with `data.expert` plans (`milx.data.experts`). With "sampling" the plans with which all scenes begin
+Plans as a run with this `data.expert` does (`milx.data.experts`). With "sampling" the plans with which all scenes begin
 are searched for first, in 512 other scenes. Nothing comes from a cache. No setting was chosen by these scenes.
 """
 
@@ -46,8 +46,10 @@ def measure(env: Env, config: DataConfig, scenes: int) -> Iterator[dict[str, Any
     """Plans and executes `scenes` scenes, rounded up to whole batches, and yields what is known after each batch."""
     began, batch = time.perf_counter(), config.plan_batch
     expert = experts.expert_of(env, config)
-    plans = {"plans_to_begin_with": int(expert.plans.success.sum())} if isinstance(expert, Sampling) else {}
-    first, counts = time.perf_counter() - began, []
+    plans, seconds, counts = {}, {}, []
+    if isinstance(expert, Sampling):
+        plans = {"plans_to_begin_with": int(expert.plans.success.sum())}
+        seconds = {"plans to begin with, with compilation": time.perf_counter() - began}
     for number in range(-(-scenes // batch)):
         demos = collect(env, jax.random.key(FIRST_SEED + number), "train", batch, 1, config)
         counts.append(int(demos.success.sum()))
@@ -58,7 +60,7 @@ def measure(env: Env, config: DataConfig, scenes: int) -> Iterator[dict[str, Any
             "success": sum(counts) / made,
             "wilson95": wilson_interval(sum(counts), made),
             "success_by_batch": [count / batch for count in counts],
-            "seconds": {"plans to begin with, with compilation": first, "total, with compilation": total},
+            "seconds": {**seconds, "total, with compilation": total},
             "scenes_per_second": made / total,
         }
 
@@ -76,9 +78,13 @@ def main(_: list[str]) -> None:
         expert = _EXPERT.value
         changes = {"expert": expert, "plan_iterations": ITERATIONS[expert], "plan_batch": _BATCH.value}
         config = dataclasses.replace(config, **changes)
-        settings = {"sampling": experts.SETTINGS, "receding": experts.RECEDING}[expert]
-        settings = dataclasses.asdict(settings) | {"first_seed": FIRST_SEED}
-        for found in measure(envs.make(name, (16, 16)), config, _SCENES.value):
+        env, settings = envs.make(name, (16, 16)), {"first_seed": FIRST_SEED}
+        settings |= (
+            dataclasses.asdict(experts.SETTINGS)
+            if expert == "sampling"
+            else dataclasses.asdict(experts.RECEDING) | {"ahead": env.ahead}
+        )
+        for found in measure(env, config, _SCENES.value):
             said = {"env": name, "data": dataclasses.asdict(config), "settings": settings}
             result = {**said, **found, **provenance.origin()}
             file = f"demonstrations-{name}.json" if expert == "sampling" else f"demonstrations-{name}-{expert}.json"

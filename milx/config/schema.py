@@ -47,8 +47,9 @@ class DataConfig:
         demos_per_task: demonstrations of each training task, in different scenes.
         noise: standard deviation of the Gaussian noise on the expert's actions, in units of the action.
         spare_demos: additional demonstrations of each validation and test task, so that failed ones can be replaced.
-        expert: how demonstrations are planned: "ilqr"; or without derivatives or a controller, "sampling" whole
-            episodes (`milx.trajopt.planner`), or "receding", the next time steps (`milx.trajopt.receding`).
+        expert: how demonstrations are planned: "ilqr"; "sampling", which plans whole episodes
+            (`milx.trajopt.planner`); or "receding", which plans the next time steps (`milx.trajopt.receding`). The
+            last two need neither derivatives nor a controller.
         plan_iterations: iterations of trajectory optimization for a demonstration: with "ilqr" their maximum number, or
             0 to use the environment's controller instead; with "sampling" their number, 8 in the results that are
             reported; with "receding" their number in each of many plans, for which 1 is enough.

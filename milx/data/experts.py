@@ -22,14 +22,15 @@ EXPERTS = ("ilqr", "sampling", "receding")
 SETTINGS = Settings()
 """Of experts that plan whole episodes by sampling."""
 RECEDING = receding.Settings()
-"""Of experts by sampling with a receding horizon."""
+"""Of experts with a receding horizon."""
 
 
 def expert_of(env: Env, config: DataConfig) -> Options | Sampling | receding.Settings:
     """Returns the expert that a run's settings ask for.
 
-    The first expert by sampling of an environment searches for plans with which others begin, under the same noise, and
-    keeps them in the user's cache. Scenes in which that fails begin again with the plans of others.
+    The first expert that plans whole episodes of an environment by sampling searches for plans with which others begin,
+    under the same noise, and keeps them in the user's cache. Scenes in which that fails begin again with the plans of
+    others.
 
     It says so if fewer than half of these plans succeed.
 
@@ -51,11 +52,14 @@ def expert_of(env: Env, config: DataConfig) -> Options | Sampling | receding.Set
     return Sampling(dataclasses.replace(SETTINGS, search=search), _plans(env, SETTINGS, config.noise))
 
 
-def description(config: DataConfig) -> list:
+def description(env: Env, config: DataConfig) -> list:
     """Lists what decides, beside versions, what an expert plans."""
-    by_sampling = {"sampling": SETTINGS, "receding": RECEDING}
-    settings = [config.expert, repr(by_sampling[config.expert])] if config.expert in by_sampling else []
-    return [config.noise, config.plan_iterations, *settings]
+    settings: dict[str, list] = {
+        "ilqr": [],
+        "sampling": ["sampling", repr(SETTINGS)],
+        "receding": ["receding", repr(RECEDING), env.ahead],
+    }
+    return [config.noise, config.plan_iterations, *settings[config.expert]]
 
 
 def digest(env: Env, *request: Any) -> str:

@@ -245,7 +245,7 @@ def cached(
     How many demonstrations are planned at once is left out: it changes no more than rounding, by which an expert by
     sampling may choose another of two plans that are nearly as good.
     """
-    digest = experts.digest(env, seed, split, num_tasks, num_demos, *experts.description(config))
+    digest = experts.digest(env, seed, split, num_tasks, num_demos, *experts.description(env, config))
     path = folder / f"{env.name}-{split}-{digest}.npz"
     parts = folder / f"{path.stem}.part-{config.plan_batch}"
     make = functools.partial(collect, env, jax.random.key(seed), split, num_tasks, num_demos, config, parts)

@@ -37,9 +37,10 @@ class Env(World[TaskT]):
             the controller's affair.
         long_chain: whether a step computes MJX's kinematics of more than three joints in a chain, which old CPU
             compilers must not fuse (`platform.pixel_options`).
-        ahead: time steps that an expert with a receding horizon looks ahead (`milx.trajopt.receding`).
+        ahead: time steps that an expert with a receding horizon looks ahead (`milx.trajopt.receding`), at least 1; the
+            whole episode where that is shorter.
         action_cost: weight of the action in the planner's running cost (no unit): the lower, the faster the expert.
-        version: raised when tasks, scenes, physics, costs, the steering, `ahead` or the controller change, so that no
+        version: raised when tasks, scenes, physics, costs, the steering or the controller change, so that no
             demonstration planned before it is taken for one planned after it.
     """
 

@@ -34,7 +34,7 @@ def plan(env: Env, task: Task, state: State, options: Options) -> Plan:
 
 
 class Sampling(NamedTuple):
-    """An expert by sampling.
+    """An expert that plans whole episodes by sampling.
 
     Attributes:
         settings: of the planner.

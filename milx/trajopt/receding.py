@@ -4,7 +4,8 @@ Every few time steps a search (`sampling.py`) looks `Env.ahead` time steps ahead
 around what is left of the last plan, and the first of its controls are executed (receding horizon, `replanning.py`).
 The first plan begins with controls of zero, and where noise or contacts drive the robot off, the next one begins there.
 The controls are those of `Env.steering`, candidates are rolled out by `Env.approximate_step`, and what is executed
-happens by `Env.step`. At the end of an episode plans look beyond it, as if the running costs went on.
+happens by `Env.step`. Every plan pays the episode's terminal cost for its last state, wherever in the episode that is,
+and at the end of an episode plans look beyond it, as if the running costs went on.
 
 References:
     Howell et al., "Predictive sampling: real-time behaviour synthesis with MuJoCo", arXiv:2212.00541.
@@ -67,7 +68,12 @@ def demonstrate(
 
     Returns:
         The states, with leading axes [N, T + 1], and the actions without noise [N, T, A].
+
+    Raises:
+        ValueError: for an environment that looks less than one step ahead; as `replanning.control`.
     """
+    if env.ahead < 1:
+        raise ValueError(f"ahead of {env.name}: got {env.ahead}, expected at least 1")
     ahead, steering = min(env.ahead, env.horizon), env.steering
     every = max(steps for steps in range(1, min(settings.every, ahead) + 1) if env.horizon % steps == 0)
     first = sampling.start(jnp.zeros((min(settings.knots, ahead), len(steering.low))), steering.deviation)

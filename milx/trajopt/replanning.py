@@ -1,7 +1,7 @@
 """Planning again while a plan by `sampling.py` is executed, where things turn out otherwise than planned.
 
-`control` always looks T steps ahead (receding horizon), for tasks without an end. `execute` executes one plan of T
-steps to its end, and plans what is left of it again every few steps (shrinking horizon).
+`control` always looks T steps ahead (receding horizon), also beyond the end of an episode. `execute` executes one plan
+of T steps to its end, and plans what is left of it again every few steps (shrinking horizon).
 """
 
 from collections.abc import Callable

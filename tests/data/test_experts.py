@@ -44,7 +44,7 @@ def test_what_no_expert_understands_is_refused(env, changes, message):
 
 def test_ilqr_has_the_iterations_of_the_settings(env):
     assert experts.expert_of(env, DataConfig(plan_iterations=7)) == Options(iterations=7)
-    assert experts.description(DataConfig(noise=0.2, plan_iterations=7)) == [0.2, 7]
+    assert experts.description(env, DataConfig(noise=0.2, plan_iterations=7)) == [0.2, 7]
 
 
 def test_a_receding_horizon_has_the_iterations_of_the_settings(env):
@@ -52,13 +52,18 @@ def test_a_receding_horizon_has_the_iterations_of_the_settings(env):
     assert expert == receding.Settings(search=dataclasses.replace(receding.SEARCH, iterations=3))
 
 
-def test_all_that_decides_on_demonstrations_by_sampling_describes_them(monkeypatch):
+def test_all_that_decides_on_demonstrations_by_sampling_describes_them(env, monkeypatch):
     config = DataConfig(expert="sampling", plan_iterations=4)
-    described = [experts.description(config)]
+    described = [experts.description(env, config)]
     for changes in ({"expert": "ilqr"}, {"expert": "receding"}, {"noise": 0.3}, {"plan_iterations": 5}):
-        described.append(experts.description(dataclasses.replace(config, **changes)))
+        described.append(experts.description(env, dataclasses.replace(config, **changes)))
     monkeypatch.setattr(experts, "SETTINGS", FEW)
-    described.append(experts.description(config))
+    described.append(experts.description(env, config))
+    config = dataclasses.replace(config, expert="receding")
+    monkeypatch.setattr(env, "ahead", 9)
+    described.append(experts.description(env, config))
+    monkeypatch.setattr(experts, "RECEDING", receding.Settings(every=3))
+    described.append(experts.description(env, config))
     assert all(one != other for i, one in enumerate(described) for other in described[:i])
 
 
@@ -115,4 +120,4 @@ def test_place_is_demonstrated_by_sampling(env, monkeypatch, expert, iterations)
     config = dataclasses.replace(make_config("place", preset="fast").data, **settings)
     demos = collect(env, jax.random.key(3), "validation", 12, 2, config)
     assert float(demos.success.mean()) >= 0.8
-    assert experts.description(config) != experts.description(dataclasses.replace(config, expert="ilqr"))
+    assert experts.description(env, config) != experts.description(env, dataclasses.replace(config, expert="ilqr"))

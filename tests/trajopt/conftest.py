@@ -13,7 +13,7 @@ from milx.envs.steering import Steering
 class Cart:
     """A cart on a line, driven by a force towards a place, which is the task. Its approximation is a lighter one."""
 
-    horizon, ahead, action_size = 12, 8, 1
+    name, horizon, ahead, action_size = "cart", 12, 8, 1
     action_range = -jnp.ones(1), jnp.ones(1)
 
     @property

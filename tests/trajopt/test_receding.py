@@ -29,6 +29,12 @@ def test_settings_that_make_no_sense_are_refused(changes, message):
         dataclasses.replace(SETTINGS, **changes)
 
 
+def test_an_environment_that_looks_nowhere_is_refused(cart, scenes, monkeypatch):
+    monkeypatch.setattr(type(cart), "ahead", 0)
+    with pytest.raises(ValueError, match="ahead of cart: got 0, expected at least 1"):
+        receding.demonstrate(cart, dataclasses.replace(SETTINGS, every=3), 0.0, *scenes)
+
+
 def test_demonstrations_succeed_where_standing_still_does_not(cart, scenes):
     task, start, keys = scenes
     states, _ = receding.demonstrate(cart, SETTINGS, NOISE, task, start, keys)
@@ -46,7 +52,7 @@ def test_what_is_executed_is_what_was_recorded_and_noise(cart, scenes):
         off = (driven - actions[..., 0])[np.abs(driven) < 0.99]
         assert off.size > 300
         # Three standard errors of a standard deviation.
-        np.testing.assert_allclose(off.std(), noise, rtol=3 / np.sqrt(2 * off.size), atol=1e-5)
+        np.testing.assert_allclose(np.sqrt((off**2).mean()), noise, rtol=3 / np.sqrt(2 * off.size), atol=1e-5)
 
 
 def test_plans_are_made_in_the_approximation_and_executed_in_the_world(cart, scenes):

@@ -57,7 +57,7 @@ MAX_SPEED, MAX_TURN = 0.5, 3.0
 TRACKING = 6.0
 """Rate at which the hand returns to its path (1/s)."""
 _HAND, _FINGER, _THING = slice(0, 4), 4, slice(6, 9)  # entries of qpos, and of qvel
-_TILT, _MOTION = slice(10, 12), slice(6, 12)  # entries of qpos, and of qvel
+_TILT, _MOTION = slice(10, 12), slice(6, 12)  # entries of qpos; entries of qvel
 _CANDIDATES = 256
 _GRAIN = 1e-3
 
@@ -103,6 +103,7 @@ class Grasp(Env[GraspTask]):
     goal_indices = (0, 1)
     ahead = 20
     action_cost = 0.02
+    version = 2
 
     def __init__(self, image_shape: tuple[int, int] | None = None):
         super().__init__(_build(), image_shape)
@@ -225,7 +226,8 @@ class Grasp(Env[GraspTask]):
     def running_residual(self, task: GraspTask, state: State, action: jax.Array, t: jax.Array) -> jax.Array:
         """Returns [20]: how far thing, hand and, at the end, fingers are off; tilt, final speed and action; weighted.
 
-        The thing's height is compared with that at which it is to be carried, which falls to 0 near the mat.
+        The thing's height is compared with that at which it is to be carried, which falls to 0 near the mat, and the
+        hand's place with the thing's, or in the last LEAVE steps with one that is RETREAT higher.
         """
         *across, up = self.off_target(task, state)
         away = jnp.linalg.norm(jnp.stack(across) + 1e-6)
@@ -237,6 +239,10 @@ class Grasp(Env[GraspTask]):
         moving = jnp.where(leave_now, jnp.array([SPEED_COST] * 3 + [SPIN_COST] * 3), 0.0) * state.qvel[_MOTION]
         tilt = TILT_COST * state.qpos[_TILT]
         return jnp.concatenate([jnp.stack(off), HAND_COST * hand, tilt, moving, self.action_cost * action])
+
+    def terminal_residual(self, task: GraspTask, state: State) -> jax.Array:
+        """Returns [1], zero: a plan that ends earlier pays it, too, and must not let go of the thing for it."""
+        return jnp.zeros(1)
 
     def success(self, task: GraspTask, states: State) -> jax.Array:
         """Tells whether the thing lies still on the target mat at the end, and the hand is open."""
