@@ -156,7 +156,7 @@ class Cells:
         env, method, evaluation = self._env(config), self._trainer(config).method, config.evaluation
         train, test = self._first_tasks(config), self._demos(config, "test")
         baselines = self._once(
-            ("baselines", env, *description(config.data)),
+            ("baselines", env, *description(env, config.data)),
             lambda: closed_loop.evaluate_baselines(env, test, evaluation, config.data, trial_key("test")),
         )
         clock.append(time.perf_counter())
@@ -295,7 +295,7 @@ class Cells:
         whole = dataclasses.replace(config, data=dataclasses.replace(config.data, tasks=self.capacity))
         env = self._env(config)
         which = config.seed if split == "train" else config.evaluation.shots
-        key = "demos", env, split, which, *description(config.data)
+        key = "demos", env, split, which, *description(env, config.data)
         return self._once(key, lambda: demos_of_split(env, whole, split))
 
     def _once(self, key: Any, make: Callable[[], Any]) -> Any:
