@@ -101,8 +101,9 @@ class Spec:
             the image, to those entries. It comes from the camera's calibration; None if that is unknown.
         object_indices: for each of the O objects the two indices of the entries of the state that hold its position,
             if the state contains them.
-        height_index: index of the entry of the state that holds the height of the hand, in environments where the hand
-            must come down to an object; None otherwise.
+        height_index: index of the entry of the state that holds the height of the hand, for policies to which where the
+            hand comes down is the goal; None otherwise.
+        goal_step: the time step at which where the robot is is the goal; None for the last one.
         fps: time steps in a second of recorded demonstrations; None if it is not known.
         state_names: of the entries of the state; empty if they have none.
         action_names: of the entries of the action, likewise.
@@ -121,6 +122,7 @@ class Spec:
     state_names: tuple[str, ...] = ()
     action_names: tuple[str, ...] = ()
     class_indices: tuple[int, ...] = ()
+    goal_step: int | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Returns the fields as a dictionary that can be written as JSON, with the version of their layout."""
@@ -161,6 +163,7 @@ class Spec:
             "state_names": _are_texts(spec.state_names, size),
             "action_names": _are_texts(spec.action_names, actions),
             "height_index": spec.height_index is None or _is_table((spec.height_index,), (1,), 0, size),
+            "goal_step": spec.goal_step is None or _is_table((spec.goal_step,), (1,), 1, _LARGEST),
         }
         for name in (name for name, value in good.items() if not value):
             raise ValueError(f"{name}: got {getattr(spec, name)!r:.100}, expected what a policy of these sizes has")

@@ -159,7 +159,7 @@ def sample_batch(
         def show(d: jax.Array, key: jax.Array, frames: int | None) -> Demo:
             index = frame_indices(key, horizon, frames, exponent)
             demo = jax.tree.map(lambda x: x[n, d], recorded.demo)
-            drawn = jax.tree.map(lambda x: x[index], with_goals(demo, goal_indices, None))
+            drawn = jax.tree.map(lambda x: x[index], with_goals(demo, goal_indices))
             if not (shift or recolor or crop):
                 return drawn
             image = augmented(drawn.image, jax.random.fold_in(key, 1), shift, recolor, crop)

@@ -43,7 +43,9 @@ def export(policy: Policy, out: str | pathlib.Path, shots: int = 1) -> None:
 
     def learn(params: Params, demo: dict[str, jax.Array]) -> Params:
         shown = Demo(**_with_state(demo, policy.spec))
-        return policy.method.adapt(params, with_goals(shown, policy.spec.goal_indices, policy.spec.height_index))
+        spec = policy.spec
+        shown = with_goals(shown, spec.goal_indices, spec.height_index, spec.goal_step)
+        return policy.method.adapt(params, shown)
 
     def adapt(leaves: list[jax.Array], demo: dict[str, jax.Array]) -> list[jax.Array]:
         return jax.tree.leaves(learn(jax.tree.unflatten(structure, leaves), demo))

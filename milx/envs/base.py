@@ -30,7 +30,8 @@ class Env(World[TaskT]):
         horizon: T, actions in an episode.
         criterion: what counts as success, in words, for result files.
         goal_indices: entries of the robot's state that tell where it is heading (`milx.data.goals`).
-        height_index: the entry that tells how high its hand is, where it must come down to an object; None otherwise.
+        goal_step: the time step at which where the robot is is its goal, in environments where it handles something
+            on the way; None where the goal is where it ends.
         object_indices: for each of the O objects, the two entries of the state that hold its position, where the state
             tells it.
         tactics: ways in which the controller may go about a scene, in the order of preference; what the numbers mean is
@@ -48,7 +49,7 @@ class Env(World[TaskT]):
     horizon: int
     criterion: str
     goal_indices: tuple[int, ...] = ()
-    height_index: int | None = None
+    goal_step: int | None = None
     object_indices: tuple[tuple[int, ...], ...] = ()
     tactics: tuple[float, ...] = (0.0,)
     long_chain: bool = True
@@ -144,7 +145,8 @@ class Env(World[TaskT]):
         image_to_goal = None if calibration is None else tuple(tuple(row) for row in calibration.tolist())
         image_shape = self.image_shape if self.vision else None
         sizes = image_shape, self.state_size, self.action_size
-        return Spec(*sizes, (low, high), self.goal_indices, image_to_goal, self.object_indices, self.height_index)
+        limits = (low, high)
+        return Spec(*sizes, limits, self.goal_indices, image_to_goal, self.object_indices, goal_step=self.goal_step)
 
     @property
     def image_to_goal(self) -> np.ndarray | None:

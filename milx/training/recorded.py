@@ -312,7 +312,7 @@ class RecordedRun(Run):
         fill = MOST_DEMOS - len(shown) - len(asked)
         rest = lambda x: np.pad(x[shots:], [(0, fill)] + [(0, 0)] * (x.ndim - 1))  # noqa: E731
         queries = Recorded(recorded.number, *jax.tree.map(rest, (recorded.demo, recorded.there, recorded.acts)))
-        return queries, with_goals(support, tuple(self.config.recorded.goal_indices), None)
+        return queries, with_goals(support, tuple(self.config.recorded.goal_indices))
 
 
 def _relative(errors: dict[str, float], name: str) -> float:

@@ -11,8 +11,14 @@ STATE = np.array(
 )
 
 
-def test_without_a_height_the_goal_is_the_end():
-    np.testing.assert_array_equal(goals(STATE, (0, 1), None), np.tile([5.0, 9.0], (6, 1)))
+def test_without_a_height_or_a_step_the_goal_is_the_end():
+    np.testing.assert_array_equal(goals(STATE, (0, 1)), np.tile([5.0, 9.0], (6, 1)))
+
+
+def test_with_a_step_it_is_where_the_robot_is_then_until_it_is_there():
+    np.testing.assert_array_equal(goals(STATE, (0, 1), step=2), [[2.0, 6.0]] * 2 + [[np.nan, np.nan]] * 4)
+    short = goals(STATE, (0, 1), step=20)
+    np.testing.assert_array_equal(short, [[5.0, 9.0]] * 5 + [[np.nan, np.nan]], "a demonstration may be shorter")
 
 
 def test_with_a_height_it_is_where_the_hand_comes_down_until_it_has():
@@ -24,7 +30,8 @@ def test_with_a_height_it_is_where_the_hand_comes_down_until_it_has():
 def test_goals_are_added_to_one_demonstration_or_to_several():
     demo = Demo(state=STATE)
     np.testing.assert_array_equal(with_goals(demo, (0, 1), 2).goal, goals(STATE, (0, 1), 2))
-    several = with_goals(Demo(state=np.stack([STATE, STATE[::-1]])), (0, 1), None)
+    several = with_goals(Demo(state=np.stack([STATE, STATE[::-1]])), (0, 1))
     np.testing.assert_array_equal(several.goal[:, 0], [[5.0, 9.0], [0.0, 4.0]])
-    assert with_goals(demo, (), None).goal is None
-    assert with_goals(Demo(action=STATE), (0, 1), None).goal is None
+    np.testing.assert_array_equal(with_goals(demo, (0, 1), step=2).goal, goals(STATE, (0, 1), step=2))
+    assert with_goals(demo, ()).goal is None
+    assert with_goals(Demo(action=STATE), (0, 1)).goal is None

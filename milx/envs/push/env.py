@@ -40,8 +40,10 @@ BEHIND = 1.25
 """The hand comes down about this many times as far from the goal's center as the object is."""
 NUM_JOINTS = 7
 _START = (0.0, -0.895, 0.0, 2.397, 0.0, 0.069, 0.0)
-OBJECT_COST, TIP_COST, FINAL_COST = 1.0, 0.5, 10.0
+OBJECT_COST, TIP_COST, HEIGHT_COST, FINAL_COST = 1.0, 0.5, 2.0, 10.0
 """Weights of the residuals (1/m)."""
+PUSH_HEIGHT = 0.01
+"""Height of the tip (m) at which the hand is to push."""
 _OBJECTS = ("object_0", "object_1")
 _PRONGS = ("prong_left", "prong_middle", "prong_right")
 _CANDIDATES = 64
@@ -89,10 +91,10 @@ class Push(Env[PushTask]):
     criterion = f"centre on the goal disc for at least {STEPS_ON_GOAL} of 100 steps"
     state_size = 20
     goal_indices = (14, 15)
-    height_index = 16
+    goal_step = 20
     tactics = (0.0, 0.02, -0.02)
     action_cost = 0.1
-    version = 2
+    version = 3
 
     def __init__(self, image_shape: tuple[int, int] | None = None):
         super().__init__(_build(), image_shape)
@@ -256,12 +258,14 @@ class Push(Env[PushTask]):
         return jnp.clip(torque / self.mj_model.actuator_gear[:, 0], *self.action_range)
 
     def running_residual(self, task: PushTask, state: State, action: jax.Array, t: jax.Array) -> jax.Array:
-        """Returns [11]: the object's distance from the goal, the tip's from the object (m), and the action, weighted.
+        """Returns [12]: how far the object is from the goal, the tip from the object, and how high (m), and the action.
 
-        The terms of the released code's reward, but their squares instead of their norms.
+        They are weighted. The squares of their norms are the terms of the released code's reward, without its roots,
+        and a height at which the hand pushes, since no table holds it up.
         """
-        place, tip = self.objects(state)[task.target, :2], self.hand(state.qpos)[:2]
-        return jnp.concatenate([OBJECT_COST * place, TIP_COST * (tip - place), self.action_cost * action])
+        place, tip = self.objects(state)[task.target, :2], self.hand(state.qpos)[:3]
+        height = HEIGHT_COST * (tip[2:] - PUSH_HEIGHT)
+        return jnp.concatenate([OBJECT_COST * place, TIP_COST * (tip[:2] - place), height, self.action_cost * action])
 
     def terminal_residual(self, task: PushTask, state: State) -> jax.Array:
         """Returns [2]: the object's distance from the goal (m), weighted."""
