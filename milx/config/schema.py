@@ -53,6 +53,8 @@ class DataConfig:
         plan_iterations: iterations of trajectory optimization for a demonstration: with "ilqr" their maximum number, or
             0 to use the environment's controller instead; with "sampling" their number, 8 in the results that are
             reported; with "receding" their number in each of many plans, for which 1 is enough.
+        plan_update: how candidates change a plan with "sampling" and "receding": "predictive" sampling, "cross_entropy"
+            or "mppi" (`milx.trajopt.sampling`).
         plan_batch: demonstrations planned at once; by sampling each of them rolls out 64 plans at once.
     """
 
@@ -62,6 +64,7 @@ class DataConfig:
     spare_demos: int = number(0, 0, 1000)
     expert: str = "ilqr"
     plan_iterations: int = number(16, 0, 10_000)
+    plan_update: str = "cross_entropy"
     plan_batch: int = 4096
 
 

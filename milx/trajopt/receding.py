@@ -1,7 +1,7 @@
 """Demonstrations by sampling with a receding horizon: nothing is planned to the end of an episode.
 
-Every few time steps a search (`sampling.py`) looks `Env.ahead` time steps ahead, from the state that was reached and
-around what is left of the last plan, and the first of its controls are executed (receding horizon, `replanning.py`).
+Every time step a search (`sampling.py`) looks `Env.ahead` time steps ahead, from the state that was reached and around
+what is left of the last plan, and the first of its controls is executed (receding horizon, `replanning.py`).
 The first plan begins with controls of zero, and where noise or contacts drive the robot off, the next one begins there.
 The controls are those of `Env.steering`, candidates are rolled out by `Env.approximate_step`, and what is executed
 happens by `Env.step`. Every plan pays the episode's terminal cost for its last state, wherever in the episode that is,
@@ -25,7 +25,7 @@ from milx.trajopt import replanning, sampling
 from milx.trajopt.episode import approximated, steered
 from milx.trajopt.sampling import Options
 
-SEARCH = Options("cross_entropy", samples=64, iterations=1, order=3, elites=8, deviation_min=0.03)
+SEARCH = Options("cross_entropy", samples=64, order=3, elites=4, deviation_min=0.03)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,23 +33,19 @@ class Settings:
     """Settings of demonstrations with a receding horizon.
 
     Attributes:
-        every: number of time steps from one plan to the next. It is the largest divisor of the environment's horizon
-            that is at most this, and at most the time steps that are planned ahead.
         knots: K, of a plan's spline; the time steps that are planned ahead where these are fewer.
         search: how a plan is improved.
 
     Raises:
-        ValueError: for a number that is out of range.
+        ValueError: for less than one knot.
     """
 
-    every: int = 2
     knots: int = 4
     search: Options = SEARCH
 
     def __post_init__(self) -> None:
-        for field in ("every", "knots"):
-            if (value := getattr(self, field)) < 1:
-                raise ValueError(f"{field}: got {value}, expected at least 1")
+        if self.knots < 1:
+            raise ValueError(f"knots: got {self.knots}, expected at least 1")
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
@@ -75,7 +71,6 @@ def demonstrate(
     if env.ahead < 1:
         raise ValueError(f"ahead of {env.name}: got {env.ahead}, expected at least 1")
     ahead, steering = min(env.ahead, env.horizon), env.steering
-    every = max(steps for steps in range(1, min(settings.every, ahead) + 1) if env.horizon % steps == 0)
     first = sampling.start(jnp.zeros((min(settings.knots, ahead), len(steering.low))), steering.deviation)
 
     def one(noise: jax.Array, task: Task, start: State, key: jax.Array) -> tuple[State, jax.Array]:
@@ -86,7 +81,7 @@ def demonstrate(
 
         problem = approximated(steered(env, task, start))
         states, actions = replanning.control(
-            problem, start.vector, first, ahead, env.horizon, every, key, settings.search, plant
+            problem, start.vector, first, ahead, env.horizon, 1, key, settings.search, plant
         )
         return jax.vmap(start.with_vector)(states), actions
 

@@ -96,6 +96,7 @@ class Place(Env[PlaceTask]):
     state_size = 16
     goal_indices = (7, 8)
     long_chain = False
+    ahead = 12
     version = 2
 
     def __init__(self, image_shape: tuple[int, int] | None = None):
