@@ -12,10 +12,10 @@ from milx.types import Demo
 def goals(state: jax.Array, indices: tuple[int, ...], height: int | None = None, step: int | None = None) -> jax.Array:
     """Computes the goal of every time step, [T, G].
 
-    It is where the robot is at a `step`, or, with a `height`, where the hand first comes down from above the middle of
-    its heights to below, and from then on unknown (NaN): where the hand is would be the answer then, and a goal head
-    that learns to find hands does not look for what they are about to handle. With neither, it is where the
-    demonstration ends.
+    It is where the robot is at a `step`, or without one, but with a `height`, where the hand first comes down from
+    above the middle of its heights to below, and from then on unknown (NaN): where the hand is would be the answer
+    then, and a goal head that learns to find hands does not look for what they are about to handle. With neither, it is
+    where the demonstration ends.
 
     Args:
         state: [T, S] of all time steps.
@@ -24,12 +24,12 @@ def goals(state: jax.Array, indices: tuple[int, ...], height: int | None = None,
         step: a time step; the last one where a demonstration is shorter.
     """
     place, time = state[:, jnp.array(indices, int)], jnp.arange(len(state))
-    if height is not None:
+    if step is not None:
+        reached = jnp.minimum(step, len(state) - 1)
+    elif height is not None:
         z = state[:, height]
         low = z < (z.min() + z.max()) / 2
         reached = jnp.argmax(low & (time > jnp.argmin(low)))
-    elif step is not None:
-        reached = jnp.minimum(step, len(state) - 1)
     else:
         return jnp.broadcast_to(place[-1], place.shape)
     return jnp.where(time[:, None] < reached, place[reached], jnp.nan)

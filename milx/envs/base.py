@@ -30,8 +30,10 @@ class Env(World[TaskT]):
         horizon: T, actions in an episode.
         criterion: what counts as success, in words, for result files.
         goal_indices: entries of the robot's state that tell where it is heading (`milx.data.goals`).
-        goal_step: the time step at which where the robot is is its goal, in environments where it handles something
-            on the way; None where the goal is where it ends.
+        goal_step: the time step at which the robot is at its goal, in environments where it handles something on the
+            way; None where the goal is where it ends.
+        height_index: the entry that tells how high its hand is, where policies without a `goal_step`, as they were made
+            once, head for where it comes down; None otherwise.
         object_indices: for each of the O objects, the two entries of the state that hold its position, where the state
             tells it.
         tactics: ways in which the controller may go about a scene, in the order of preference; what the numbers mean is
@@ -50,6 +52,7 @@ class Env(World[TaskT]):
     criterion: str
     goal_indices: tuple[int, ...] = ()
     goal_step: int | None = None
+    height_index: int | None = None
     object_indices: tuple[tuple[int, ...], ...] = ()
     tactics: tuple[float, ...] = (0.0,)
     long_chain: bool = True
@@ -145,8 +148,15 @@ class Env(World[TaskT]):
         image_to_goal = None if calibration is None else tuple(tuple(row) for row in calibration.tolist())
         image_shape = self.image_shape if self.vision else None
         sizes = image_shape, self.state_size, self.action_size
-        limits = (low, high)
-        return Spec(*sizes, limits, self.goal_indices, image_to_goal, self.object_indices, goal_step=self.goal_step)
+        return Spec(
+            *sizes,
+            (low, high),
+            self.goal_indices,
+            image_to_goal,
+            self.object_indices,
+            height_index=self.height_index,
+            goal_step=self.goal_step,
+        )
 
     @property
     def image_to_goal(self) -> np.ndarray | None:

@@ -17,6 +17,7 @@ def test_without_a_height_or_a_step_the_goal_is_the_end():
 
 def test_with_a_step_it_is_where_the_robot_is_then_until_it_is_there():
     np.testing.assert_array_equal(goals(STATE, (0, 1), step=2), [[2.0, 6.0]] * 2 + [[np.nan, np.nan]] * 4)
+    np.testing.assert_array_equal(goals(STATE, (0, 1), 2, 2), goals(STATE, (0, 1), step=2))
     short = goals(STATE, (0, 1), step=20)
     np.testing.assert_array_equal(short, [[5.0, 9.0]] * 5 + [[np.nan, np.nan]], "a demonstration may be shorter")
 

@@ -92,6 +92,7 @@ class Push(Env[PushTask]):
     state_size = 20
     goal_indices = (14, 15)
     goal_step = 20
+    height_index = 16
     tactics = (0.0, 0.02, -0.02)
     action_cost = 0.1
     version = 3
