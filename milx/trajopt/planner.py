@@ -27,7 +27,7 @@ from milx.trajopt.ilqr import Problem
 from milx.trajopt.sampling import Options, Search
 
 SEARCH = Options("cross_entropy", samples=32, iterations=8, order=3, elites=6, deviation_min=0.03)
-AGAIN = Options("predictive", samples=32, order=3)
+AGAIN = Options("cross_entropy", samples=32, order=3, elites=6)
 
 
 @dataclasses.dataclass(frozen=True)
