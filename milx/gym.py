@@ -126,7 +126,13 @@ class GymEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         return {name: np.asarray(values[name], space.dtype) for name, space in self._seen.items()}
 
 
-IDS = {"reach": "milx/Reach-v0", "reach_state": "milx/ReachState-v0", "push": "milx/Push-v0", "place": "milx/Place-v0"}
+IDS = {
+    "reach": "milx/Reach-v0",
+    "reach_state": "milx/ReachState-v0",
+    "push": "milx/Push-v0",
+    "place": "milx/Place-v0",
+    "grasp": "milx/Grasp-v0",
+}
 """What Gymnasium calls milx's environments."""
 
 for _name, _id in IDS.items():

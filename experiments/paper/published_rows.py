@@ -132,6 +132,12 @@ _BASELINES = {
     )
 }
 
+_GRASP = {
+    "grasp": Row("grasp", "grasp", {}),
+    "grasp-lstm": Row("grasp, LSTM", "grasp", _MUON, method="lstm"),
+    "grasp-contextual": Row("grasp, contextual", "grasp", _MUON, method="contextual"),
+}
+
 _GOAL_HEAD = {"network.goal_head": True, "method.goal_weight": 1.0, "network.calibrate": False}
 _STEPS = {
     "reach": (
@@ -237,5 +243,6 @@ TABLES: dict[str, dict[str, Row]] = {
     "ladder": _LADDER,
     "relatives": _RELATIVES,
     "experts": _EXPERTS,
+    "grasp": _GRASP,
 }
 """The rows of every table, by name; a row that is one of the results, too, is trained there."""

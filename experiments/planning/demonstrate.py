@@ -23,13 +23,11 @@ from absl import app, flags
 import milx
 from milx import envs
 from milx.config.assemble import make_config
-from milx.config.registry import register_env_at
 from milx.config.schema import DataConfig
 from milx.core import files
 from milx.data import experts
 from milx.data.simulated import collect
 from milx.envs.base import Env
-from milx.envs.push.presets import PUSH
 from milx.evaluation import provenance
 from milx.evaluation.intervals import wilson_interval
 from milx.trajopt.expert import Sampling
@@ -37,9 +35,6 @@ from milx.trajopt.expert import Sampling
 FIRST_SEED = 1000
 """Of the scenes; push.py and the trials by which settings were chosen have smaller ones."""
 ITERATIONS = {"sampling": 8, "receding": 1}
-
-# Not one of milx's environments until its experts succeed often enough.
-register_env_at("grasp", "milx.envs.grasp.env:Grasp", {"fast": PUSH["fast"] | {"env.image_shape": (90, 100)}})
 
 
 def measure(env: Env, config: DataConfig, scenes: int) -> Iterator[dict[str, Any]]:

@@ -4,6 +4,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from milx.config.registry import ENVS, register_env_at
+from milx.envs.grasp.presets import GRASP
 from milx.envs.place.presets import PLACE, PLACE_DURATIONS
 from milx.envs.push.presets import PUSH, PUSH_DURATIONS
 from milx.envs.reach.presets import REACH, REACH_DURATIONS, REACH_STATE
@@ -17,6 +18,7 @@ register_env_at("reach", "milx.envs.reach.env:Reach", REACH, REACH_DURATIONS)
 register_env_at("reach_state", "milx.envs.reach.env:ReachState", REACH_STATE)
 register_env_at("push", "milx.envs.push.env:Push", PUSH, PUSH_DURATIONS)
 register_env_at("place", "milx.envs.place.env:Place", PLACE, PLACE_DURATIONS)
+register_env_at("grasp", "milx.envs.grasp.env:Grasp", GRASP)
 
 
 def find(name: str) -> "type[Env]":

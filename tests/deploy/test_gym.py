@@ -42,7 +42,7 @@ def test_gymnasium_makes_them_itself():
         assert reward == theirs
     with warnings.catch_warnings(action="ignore"):
         check_env(made.unwrapped)
-    assert set(gym.IDS) == {"reach", "reach_state", "push", "place"} <= set(envs.ENVS)
+    assert set(gym.IDS) == {"reach", "reach_state", "push", "place", "grasp"} <= set(envs.ENVS)
 
 
 def test_an_episode_is_the_environments(gym_env):
