@@ -88,7 +88,7 @@ def test_rendering_imports_nothing_of_the_other_packages():
     ],
 )
 def test_what_milx_brings_is_registered_however_it_is_asked_for(first):
-    expected = "reach reach_state push place mil contextual lstm lstm_attention"
+    expected = "reach reach_state push place grasp mil contextual lstm lstm_attention"
     assert printed(f"{first}; print(*names[0], *names[1])") == expected
 
 
@@ -126,7 +126,7 @@ for thread in threads: thread.start()
 for thread in threads: thread.join()
 print(len(found), *{tuple(names) for names in found})
 """
-    assert printed(code) == "4 ('reach', 'reach_state', 'push', 'place')"
+    assert printed(code) == "4 ('reach', 'reach_state', 'push', 'place', 'grasp')"
 
 
 def test_a_registry_is_copied_as_a_dictionary():

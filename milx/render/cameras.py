@@ -19,6 +19,7 @@ def render(
     *,
     mjx_model: mjx.Model | None = None,
     shadows: bool = False,
+    max_triangles: int | None = None,
 ) -> Frame:
     """Renders color, depth and geom ids; may be used under `jax.jit`, `jax.vmap`, `jax.lax.scan` and `jax.grad`.
 
@@ -34,19 +35,21 @@ def render(
         width: of an image, in pixels.
         mjx_model: whose sizes, colors and lights count, see `Renderer.scene`; those of `model` by default.
         shadows: whether lights with `castshadow` throw hard shadows.
+        max_triangles: to how many, about, a mesh with more is simplified; None to keep them all.
 
     Returns:
         The frame; of several cameras, all its arrays have a leading axis of them, in the order given.
 
     Raises:
         ValueError: no camera is given, or one that does not exist, or the model asks for what cannot be shown.
+        ImportError: for `max_triangles` without the extra "meshes".
     """
     if isinstance(camera, str | int):
-        renderer = Renderer(model, camera, height, width, shadows=shadows)
+        renderer = Renderer(model, camera, height, width, shadows=shadows, max_triangles=max_triangles)
         return renderer.render(renderer.scene(data, mjx_model))
     if not camera:
         raise ValueError("camera: got none, expected at least one")
-    first = Renderer(model, camera[0], height, width, shadows=shadows)
+    first = Renderer(model, camera[0], height, width, shadows=shadows, max_triangles=max_triangles)
     renderers = [first, *map(first.with_camera, camera[1:])]
     frames = [renderer.render(renderer.scene(data, mjx_model)) for renderer in renderers]
     return jax.tree.map(lambda *arrays: jnp.stack(arrays), *frames)

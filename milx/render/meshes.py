@@ -26,6 +26,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from milx.render.decimate import decimate
+
 Vector = tuple[jax.Array, ...]
 LEAF = 2
 """Triangles of a leaf."""
@@ -43,6 +45,7 @@ class Meshes(NamedTuple):
         first: [N] int32, a leaf's first triangle; -1 if the node has children.
         triangle: [F, 3, 3], a, u and v (m). Leaves with fewer than LEAF triangles repeat their last one.
         normal: [F, 3, 3], unit normals n_a, n_b and n_c at the corners.
+        texcoord: [F, 3, 2], texture coordinates (s, t) at the corners; zero for meshes that have none.
         root: [G] int32, the node where a geom's mesh begins; 0 for other geoms.
     """
 
@@ -51,24 +54,38 @@ class Meshes(NamedTuple):
     first: np.ndarray
     triangle: np.ndarray
     normal: np.ndarray
+    texcoord: np.ndarray
     root: np.ndarray
 
 
-def of_model(model: mujoco.MjModel, geoms: np.ndarray) -> Meshes:
-    """Builds the hierarchies of the meshes of some geoms, each mesh once."""
+def of_model(model: mujoco.MjModel, geoms: np.ndarray, most: int | None = None) -> Meshes:
+    """Builds the hierarchies of the meshes of some geoms, each mesh once, and of `most` triangles at most, about.
+
+    Raises:
+        ImportError: as `decimate.decimate`.
+    """
     root, nodes = np.zeros(model.ngeom, np.int32), _Nodes()
     begins: dict[int, int] = {}
     for geom in geoms:
         mesh = int(model.geom_dataid[geom])
         if mesh not in begins:
             begins[mesh] = len(nodes.box)
-            first, count = model.mesh_faceadr[mesh], model.mesh_facenum[mesh]
-            faces = slice(first, first + count)
-            corners = model.mesh_vert[model.mesh_vertadr[mesh] + model.mesh_face[faces]]
-            normals = model.mesh_normal[model.mesh_normaladr[mesh] + model.mesh_facenormal[faces]]
-            nodes.add(np.concatenate([corners, normals], axis=-1))
+            corners = _corners(model, mesh)
+            nodes.add(corners if most is None else decimate(corners, most))
         root[geom] = begins[mesh]
     return nodes.arrays(root)
+
+
+def _corners(model: mujoco.MjModel, mesh: int) -> np.ndarray:
+    """Returns [F, 3, 8], the positions of the corners of a mesh's triangles, normals and texture coordinates there."""
+    first, count = model.mesh_faceadr[mesh], model.mesh_facenum[mesh]
+    faces = slice(first, first + count)
+    place = model.mesh_vert[model.mesh_vertadr[mesh] + model.mesh_face[faces]]
+    normal = model.mesh_normal[model.mesh_normaladr[mesh] + model.mesh_facenormal[faces]]
+    texcoord = np.zeros((count, 3, 2), place.dtype)
+    if (begin := model.mesh_texcoordadr[mesh]) >= 0:
+        texcoord = model.mesh_texcoord[begin + model.mesh_facetexcoord[faces]]
+    return np.concatenate([place, normal, texcoord], axis=-1)
 
 
 class _Nodes:
@@ -81,7 +98,7 @@ class _Nodes:
         self.corners: list[np.ndarray] = []
 
     def add(self, corners: np.ndarray) -> None:
-        """Adds the nodes of triangles [F, 3, 6], the positions of their corners and the normals there."""
+        """Adds the nodes of triangles, of whose corners the table [F, 3, 8] begins with the positions."""
         node, place = len(self.box), corners[..., :3]
         self.box.append(np.concatenate([place.min(axis=(0, 1)), place.max(axis=(0, 1))]))
         self.skip.append(-1)
@@ -100,13 +117,14 @@ class _Nodes:
     def arrays(self, root: np.ndarray) -> Meshes:
         """Makes arrays of all nodes."""
         corners = np.concatenate(self.corners).astype(float)
-        (a, b, c), normal = np.moveaxis(corners[..., :3], 1, 0), corners[..., 3:]
+        (a, b, c), normal = np.moveaxis(corners[..., :3], 1, 0), corners[..., 3:6]
         flat = np.cross(b - a, c - a)
         flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-30)
         along = np.abs(np.einsum("fi,fci->fc", flat, normal))[..., None] < _IN_PLANE
         normal = np.where(along, flat[:, None], normal)
         skip, first = np.array(self.skip, np.int32), np.array(self.first, np.int32)
-        return Meshes(np.array(self.box), skip, first, np.stack([a, b - a, c - a], axis=1), normal, root)
+        triangle = np.stack([a, b - a, c - a], axis=1)
+        return Meshes(np.array(self.box), skip, first, triangle, normal, corners[..., 6:], root)
 
 
 def _cross(a: Vector, b: Vector) -> Vector:
@@ -181,8 +199,8 @@ def meet(
     return nearest, found
 
 
-def normal(meshes: Meshes, triangle: jax.Array, o: Vector, d: Vector) -> Vector:
-    """Computes the unit normals of the surface where rays meet triangles, on the side that they meet.
+def surface(meshes: Meshes, triangle: jax.Array, o: Vector, d: Vector) -> tuple[Vector, Vector]:
+    """Computes what the surface is like where rays meet triangles.
 
     Args:
         meshes: the hierarchies.
@@ -191,15 +209,20 @@ def normal(meshes: Meshes, triangle: jax.Array, o: Vector, d: Vector) -> Vector:
         d: three [P] arrays, their directions.
 
     Returns:
-        Three [P] arrays in the frame of the mesh; of any finite length where a ray meets nothing.
+        The unit normals, on the side that the rays meet, three [P] arrays in the frame of the mesh, of any finite
+        length where a ray meets nothing; and the texture coordinates, two [P] arrays.
     """
     corners = jnp.asarray(meshes.triangle, d[0].dtype)[triangle]
     _, beta, gamma = _meet(corners, o, d)
-    at_a, at_b, at_c = (_columns(jnp.asarray(meshes.normal[:, i], d[0].dtype)[triangle]) for i in range(3))
     beta = jnp.clip(beta, 0.0, 1.0)  # β and γ are outside of these limits only where nothing is met
     gamma = jnp.clip(gamma, 0.0, 1 - beta)
-    smooth = tuple((1 - beta - gamma) * a + beta * b + gamma * c for a, b, c in zip(at_a, at_b, at_c, strict=True))
-    flat = _cross(_columns(corners[:, 1]), _columns(corners[:, 2]))
+
+    def interpolated(table: np.ndarray) -> Vector:
+        at = jnp.asarray(table, d[0].dtype)[triangle]
+        a, b, c = (at[:, i].T for i in range(3))
+        return tuple((1 - beta - gamma) * a + beta * b + gamma * c)
+
+    smooth, flat = interpolated(meshes.normal), _cross(_columns(corners[:, 1]), _columns(corners[:, 2]))
     met = jnp.where(_dot(flat, d) > 0, -1.0, 1.0) * jnp.where(_dot(flat, smooth) < 0, -1.0, 1.0)
     inverse = met * jax.lax.rsqrt(jnp.maximum(_dot(smooth, smooth), _TINY))
-    return inverse * smooth[0], inverse * smooth[1], inverse * smooth[2]
+    return tuple(inverse * x for x in smooth), interpolated(meshes.texcoord)

@@ -1,4 +1,4 @@
-"""The surface where a ray arrives: unit normals of the shapes of `raycast.py`.
+"""The surface where a ray arrives: unit normals of the shapes of `raycast.py`, and texture coordinates of meshes.
 
 A normal is a gradient, which the transposed map of a geom carries back into the camera frame.
 """
@@ -23,8 +23,8 @@ def at_points(
     geom_id: jax.Array,
     point: Vector,
     triangles: Meshes | None = None,
-) -> Vector:
-    """Computes the unit normals of the surfaces, three [P] arrays in the camera frame.
+) -> tuple[Vector, Vector | None]:
+    """Computes the unit normals of the surfaces, three [P] arrays in the camera frame, and texture coordinates.
 
     Args:
         groups: static geom ids by kind.
@@ -32,6 +32,9 @@ def at_points(
         geom_id: [P] int32, the geom that each point lies on. Any point gives finite values.
         point: three [P] arrays, m, in the camera frame. On a mesh it must be what the camera sees of it.
         triangles: of the meshes; None if there is none.
+
+    Returns:
+        The normals; and s and t, two [P] arrays that mean something on meshes alone, or None if there is none.
     """
     kind_of_geom = np.zeros(maps.stretch.shape, np.int32)
     for kind, ids in groups.items():
@@ -39,14 +42,14 @@ def at_points(
     kinds = jnp.asarray(kind_of_geom)[geom_id]
     entries = maps.affine.reshape(-1, 12)[geom_id]
     rows = tuple(tuple(entries[:, 4 * i + j] for j in range(4)) for i in range(3))
-    facing = None
+    facing = texcoord = None
     if triangles is not None:  # the way from the camera to the point leads to the triangle
         root = jnp.where(kinds == Kind.MESH, jnp.asarray(triangles.root)[geom_id], len(triangles.skip))
         ray = tuple(dot(row[:3], point) for row in rows)
         eye = tuple(row[3] for row in rows)
         _, seen = meshes.meet(triangles, root, eye, ray, _SEEN)
-        facing = meshes.normal(triangles, seen, eye, ray)
-    return surface_normal(kinds, rows, maps.stretch[geom_id], point, facing)
+        facing, texcoord = meshes.surface(triangles, seen, eye, ray)
+    return surface_normal(kinds, rows, maps.stretch[geom_id], point, facing), texcoord
 
 
 def surface_normal(

@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 from milx.core.mjx import mjx
-from milx.render import meshes, normals, raycast, shade, textures
+from milx.render import images, meshes, normals, raycast, shade, textures
 from milx.render.textures import Textures
 
 _DIRECTIONAL = int(mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
@@ -66,12 +66,19 @@ class Renderer:
 
     All geoms in groups 0 to 2 are rendered, as MuJoCo does by default. Near and far planes are MuJoCo's
     (`visual/map/znear` and `zfar`, in units of the model's extent). Meshes have MuJoCo's normals at their corners,
-    interpolated; MuJoCo's textures are not drawn. The color is differentiable with respect to the colors and the
-    lights; the geometry carries no gradient.
+    interpolated, and those with texture coordinates their two-dimensional textures; MuJoCo's other textures are not
+    drawn. The color is differentiable with respect to the colors and the lights; the geometry carries no gradient.
     """
 
     def __init__(
-        self, model: mujoco.MjModel, camera: str | int, height: int, width: int, *, shadows: bool = False
+        self,
+        model: mujoco.MjModel,
+        camera: str | int,
+        height: int,
+        width: int,
+        *,
+        shadows: bool = False,
+        max_triangles: int | None = None,
     ) -> None:
         """Prepares what does not change from frame to frame.
 
@@ -81,19 +88,22 @@ class Renderer:
             height: of the image, in pixels.
             width: of the image, in pixels.
             shadows: whether lights with `castshadow` throw hard shadows; each costs about as much as all the rest.
+            max_triangles: to how many, about, a mesh with more is simplified (`decimate.py`); None to keep them all.
 
         Raises:
             ValueError: there is no such camera, or the model asks for what this renderer cannot show.
+            ImportError: for `max_triangles` without the extra "meshes".
         """
-        for name, value in (("height", height), ("width", width)):
-            if value < 1:
-                raise ValueError(f"{name}={value!r}: expected at least 1 pixel")
+        for name, value in (("height", height), ("width", width), ("max_triangles", max_triangles)):
+            if value is not None and value < 1:
+                raise ValueError(f"{name}={value!r}: expected at least 1")
         self.height, self.width = height, width
         self._model = model
         self._near, self._far = (float(edge * model.stat.extent) for edge in (model.vis.map.znear, model.vis.map.zfar))
         self._groups = _group_geoms(model)
         shown = self._groups.get(raycast.Kind.MESH)
-        self._meshes = None if shown is None else meshes.of_model(model, shown)
+        self._meshes = None if shown is None else meshes.of_model(model, shown, max_triangles)
+        self._images = None if shown is None else images.of_model(model, shown)
         _check_lights(model)
         self._shadows = shadows
         self._materials = _materials(model)
@@ -160,7 +170,7 @@ class Renderer:
         # Where nothing is hit any finite point will do, but infinity would turn into NaN in the gradients.
         point = tuple(jnp.where(hit, distance, 1.0) * ray for ray in rays)
         winner = jnp.maximum(geom_id, 0)
-        normal = normals.at_points(self._groups, maps, winner, point, self._meshes)
+        normal, texcoord = normals.at_points(self._groups, maps, winner, point, self._meshes)
 
         rgba, made_of = scene.geom_rgba[winner], jnp.asarray(self._materials, float)[winner]
         rgb = tuple(rgba[:, i] for i in range(3))
@@ -168,6 +178,8 @@ class Renderer:
             family, second, frame = jax.tree.map(lambda x: x[winner], _in_camera(scene.texture, scene))
             rows = tuple(tuple(frame[:, i, j] for j in range(4)) for i in range(3))
             rgb = textures.mix(rgb, family, tuple(second[:, i] for i in range(3)), rows, point)
+        if self._images is not None and texcoord is not None:
+            rgb = images.mix(self._images, rgb, winner, texcoord)
         material = shade.Material(rgb, *(made_of[:, i] for i in range(3)))
         color = shade.emitted(material)
         for casts, lights in self._lights(scene).items():

@@ -159,13 +159,16 @@ def test_rays_find_the_nearest_of_all_triangles(least):
 def test_normals_are_interpolated_on_the_side_that_a_ray_meets(at, expected, turned, height):
     """Works out a triangle in the plane z = 0 by hand, at (0.3, 0.2), where the corners weigh 0.5, 0.3 and 0.2."""
     corners, nodes = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), meshes._Nodes()
-    nodes.add(np.concatenate([corners, turned * np.array(at)], axis=-1)[None])
+    texcoord = [[0.0, 0.0], [2.0, 0.0], [1.0, 3.0]]
+    nodes.add(np.concatenate([corners, turned * np.array(at), texcoord], axis=-1)[None])
     tables = nodes.arrays(np.zeros(1, np.int32))
-    facing = lambda o, d: meshes.normal(tables, jnp.zeros(1, jnp.int32), o, d)  # noqa: E731
+    surface = lambda o, d: meshes.surface(tables, jnp.zeros(1, jnp.int32), o, d)  # noqa: E731
     rays = [tuple(jnp.full(1, x) for x in ray) for ray in ((0.3, 0.2, height), (0.0, 0.0, -height))]
-    found = np.ravel(facing(*rays))
+    found, place = (np.ravel(x) for x in surface(*rays))
+    np.testing.assert_allclose(place, [0.3 * 2 + 0.2 * 1, 0.2 * 3], atol=1e-6)
     np.testing.assert_allclose(found, np.sign(height) * np.array(expected) / np.linalg.norm(expected), atol=1e-6)
-    assert np.isfinite(facing(rays[0], tuple(jnp.full(1, x) for x in (1.0, 0.0, 0.0)))).all(), "a ray that misses"
+    missed, _ = surface(rays[0], tuple(jnp.full(1, x) for x in (1.0, 0.0, 0.0)))
+    assert np.isfinite(missed).all(), "a ray that misses"
 
 
 def ball(radius: float, reverse: bool, where: str) -> str:
