@@ -3,7 +3,8 @@
 Edges are collapsed where the surface moves least, by quadric error metrics (Garland & Heckbert, "Surface simplification
 using quadric error metrics", SIGGRAPH 1997), by the library fast-simplification. Every new corner takes its normal and
 its texture coordinates from the nearest old one that faces about as the new triangle does, so that sharp edges stay
-sharp.
+sharp. Open borders stay as they are, since holes would open where sheets of triangles meet: a mesh of many sheets keeps
+more triangles.
 """
 
 import numpy as np
@@ -21,7 +22,7 @@ def decimate(corners: np.ndarray, count: int) -> np.ndarray:
         count: how many triangles there are to be; with as many as F, or more, nothing changes.
 
     Returns:
-        [F', 3, C] with F' about `count`.
+        [F', 3, C] with F' about `count`, or more where there are open borders.
 
     Raises:
         ImportError: without the library fast-simplification.
@@ -36,7 +37,8 @@ def decimate(corners: np.ndarray, count: int) -> np.ndarray:
 
     old = corners.reshape(-1, corners.shape[-1]).astype(float)
     points, faces = np.unique(old[:, :3], axis=0, return_inverse=True)
-    points, faces = fast_simplification.simplify(points, faces.reshape(-1, 3).astype(np.int32), target_count=count)
+    faces = faces.reshape(-1, 3).astype(np.int32)
+    points, faces = fast_simplification.simplify(points, faces, target_count=count, preserve_border=True)
     place = points[faces]
     flat = np.cross(place[:, 1] - place[:, 0], place[:, 2] - place[:, 0])
     flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-30)
