@@ -47,6 +47,7 @@ class Meshes(NamedTuple):
         normal: [F, 3, 3], unit normals n_a, n_b and n_c at the corners.
         texcoord: [F, 3, 2], texture coordinates (s, t) at the corners; zero for meshes that have none.
         root: [G] int32, the node where a geom's mesh begins; 0 for other geoms.
+        radius: [G], how far a geom's mesh reaches from its origin (m); 0 for other geoms.
     """
 
     box: np.ndarray
@@ -56,6 +57,7 @@ class Meshes(NamedTuple):
     normal: np.ndarray
     texcoord: np.ndarray
     root: np.ndarray
+    radius: np.ndarray
 
 
 def of_model(model: mujoco.MjModel, geoms: np.ndarray, most: int | None = None) -> Meshes:
@@ -64,16 +66,17 @@ def of_model(model: mujoco.MjModel, geoms: np.ndarray, most: int | None = None) 
     Raises:
         ImportError: as `decimate.decimate`.
     """
-    root, nodes = np.zeros(model.ngeom, np.int32), _Nodes()
-    begins: dict[int, int] = {}
+    root, radius, nodes = np.zeros(model.ngeom, np.int32), np.zeros(model.ngeom), _Nodes()
+    of_mesh: dict[int, tuple[int, float]] = {}
     for geom in geoms:
         mesh = int(model.geom_dataid[geom])
-        if mesh not in begins:
-            begins[mesh] = len(nodes.box)
+        if mesh not in of_mesh:
             corners = _corners(model, mesh)
-            nodes.add(corners if most is None else decimate(corners, most))
-        root[geom] = begins[mesh]
-    return nodes.arrays(root)
+            corners = corners if most is None else decimate(corners, most)
+            of_mesh[mesh] = len(nodes.box), float(np.linalg.norm(corners[..., :3], axis=-1).max())
+            nodes.add(corners)
+        root[geom], radius[geom] = of_mesh[mesh]
+    return nodes.arrays(root, radius)
 
 
 def _corners(model: mujoco.MjModel, mesh: int) -> np.ndarray:
@@ -114,7 +117,7 @@ class _Nodes:
             self.add(corners[order[half:]])
         self.skip[node] = len(self.box)
 
-    def arrays(self, root: np.ndarray) -> Meshes:
+    def arrays(self, root: np.ndarray, radius: np.ndarray) -> Meshes:
         """Makes arrays of all nodes."""
         corners = np.concatenate(self.corners).astype(float)
         (a, b, c), normal = np.moveaxis(corners[..., :3], 1, 0), corners[..., 3:6]
@@ -124,7 +127,7 @@ class _Nodes:
         normal = np.where(along, flat[:, None], normal)
         skip, first = np.array(self.skip, np.int32), np.array(self.first, np.int32)
         triangle = np.stack([a, b - a, c - a], axis=1)
-        return Meshes(np.array(self.box), skip, first, triangle, normal, corners[..., 6:], root)
+        return Meshes(np.array(self.box), skip, first, triangle, normal, corners[..., 6:], root, radius)
 
 
 def _cross(a: Vector, b: Vector) -> Vector:
@@ -135,20 +138,69 @@ def _dot(a: Vector, b: Vector) -> jax.Array:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def _columns(table: jax.Array) -> Vector:
-    """Splits [P, 3] into three [P]."""
-    return table[:, 0], table[:, 1], table[:, 2]
+def _vectors(table: jax.Array) -> tuple[Vector, Vector, Vector]:
+    """Splits [P, 3, D] into three vectors of D arrays [P]."""
+    a, b, c = (tuple(table[:, i].T) for i in range(3))
+    return a, b, c
 
 
-def _meet(triangle: jax.Array, o: Vector, d: Vector) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Computes the distances [P] to triangles [P, 3, 3], infinite for rays that miss them, and β and γ."""
-    a, u, v = (_columns(triangle[:, i]) for i in range(3))
+def crosses(box: Vector, o: Vector, inverse: Vector) -> tuple[jax.Array, jax.Array]:
+    """Computes where rays enter and leave a box; they miss it where they leave before they enter.
+
+    Args:
+        box: the three coordinates of the lowest corner, then those of the highest.
+        o: where the rays start.
+        inverse: 1 / d, as `inverse_of` has it.
+    """
+    ends = [((box[i] - o[i]) * inverse[i], (box[3 + i] - o[i]) * inverse[i]) for i in range(3)]
+    enters = jnp.maximum(jnp.maximum(jnp.minimum(*ends[0]), jnp.minimum(*ends[1])), jnp.minimum(*ends[2]))
+    leaves = jnp.minimum(jnp.minimum(jnp.maximum(*ends[0]), jnp.maximum(*ends[1])), jnp.maximum(*ends[2]))
+    return enters, leaves
+
+
+def inverse_of(d: Vector) -> Vector:
+    """Computes 1 / d; a ray along a box's side meets it very far away."""
+    return tuple(1 / jnp.where(jnp.abs(x) < _TINY, _TINY, x) for x in d)
+
+
+def intersect(triangle: tuple[Vector, Vector, Vector], o: Vector, d: Vector) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Computes the distances to triangles a, u and v, infinite for rays that miss them, and β and γ."""
+    a, u, v = triangle
     s, n = tuple(x - y for x, y in zip(o, a, strict=True)), _cross(u, v)
     det = -_dot(d, n)
     inverse = 1 / jnp.where(det != 0, det, 1.0)
     beta, gamma = -_dot(d, _cross(s, v)) * inverse, -_dot(d, _cross(u, s)) * inverse
     hit = (det != 0) & (beta >= 0) & (gamma >= 0) & (beta + gamma <= 1)
     return jnp.where(hit, _dot(s, n) * inverse, jnp.inf), beta, gamma
+
+
+def facing(
+    triangle: tuple[Vector, Vector, Vector], corners: tuple[Vector, Vector, Vector], o: Vector, d: Vector
+) -> tuple[Vector, jax.Array, jax.Array]:
+    """Interpolates the unit normal where rays meet triangles, on the side that they meet.
+
+    Args:
+        triangle: a, u and v.
+        corners: n_a, n_b and n_c.
+        o: where the rays start.
+        d: their directions.
+
+    Returns:
+        The normals, of any finite length where a ray meets nothing; and β and γ, which are valid weights there, too.
+    """
+    _, beta, gamma = intersect(triangle, o, d)
+    beta = jnp.clip(beta, 0.0, 1.0)
+    gamma = jnp.clip(gamma, 0.0, 1 - beta)
+    smooth = interpolate(corners, beta, gamma)
+    flat = _cross(triangle[1], triangle[2])
+    met = jnp.where(_dot(flat, d) > 0, -1.0, 1.0) * jnp.where(_dot(flat, smooth) < 0, -1.0, 1.0)
+    inverse = met * jax.lax.rsqrt(jnp.maximum(_dot(smooth, smooth), _TINY))
+    return tuple(inverse * x for x in smooth), beta, gamma
+
+
+def interpolate(corners: tuple[Vector, Vector, Vector], beta: jax.Array, gamma: jax.Array) -> Vector:
+    """Weighs what the three corners have."""
+    return tuple((1 - beta - gamma) * a + beta * b + gamma * c for a, b, c in zip(*corners, strict=True))
 
 
 def meet(
@@ -173,22 +225,17 @@ def meet(
     skip, first = jnp.asarray(meshes.skip), jnp.asarray(meshes.first)
     start = jnp.broadcast_to(jnp.asarray(root, jnp.int32), o[0].shape)
     end = jnp.where(start < count, skip[jnp.minimum(start, count - 1)], start)
-    inverse = tuple(1 / jnp.where(jnp.abs(x) < _TINY, _TINY, x) for x in d)
+    inverse = inverse_of(d)
 
     def visit(state: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
         node, nearest, found = state
         at = jnp.minimum(node, count - 1)
-        low, high = _columns(box[at, :3]), _columns(box[at, 3:])
-        sides = [((low[i] - o[i]) * inverse[i], (high[i] - o[i]) * inverse[i]) for i in range(3)]
-        enters = jnp.maximum(*(jnp.minimum(*sides[i]) for i in (0, 1)))
-        enters = jnp.maximum(enters, jnp.minimum(*sides[2]))
-        leaves = jnp.minimum(*(jnp.maximum(*sides[i]) for i in (0, 1)))
-        leaves = jnp.minimum(leaves, jnp.maximum(*sides[2]))
+        enters, leaves = crosses(tuple(box[at].T), o, inverse)
         inside = (enters <= leaves) & (leaves >= least) & (enters < nearest) & (node < end)
         leaf = first[at] >= 0
         for number in range(LEAF):
             index = jnp.maximum(first[at], 0) + number
-            t, *_ = _meet(triangle[index], o, d)
+            t, *_ = intersect(_vectors(triangle[index]), o, d)
             nearer = inside & leaf & (t >= least) & (t < nearest)
             nearest, found = jnp.where(nearer, t, nearest), jnp.where(nearer, index, found)
         after = jnp.where(inside & ~leaf, at + 1, skip[at])
@@ -212,17 +259,7 @@ def surface(meshes: Meshes, triangle: jax.Array, o: Vector, d: Vector) -> tuple[
         The unit normals, on the side that the rays meet, three [P] arrays in the frame of the mesh, of any finite
         length where a ray meets nothing; and the texture coordinates, two [P] arrays.
     """
-    corners = jnp.asarray(meshes.triangle, d[0].dtype)[triangle]
-    _, beta, gamma = _meet(corners, o, d)
-    beta = jnp.clip(beta, 0.0, 1.0)  # β and γ are outside of these limits only where nothing is met
-    gamma = jnp.clip(gamma, 0.0, 1 - beta)
-
-    def interpolated(table: np.ndarray) -> Vector:
-        at = jnp.asarray(table, d[0].dtype)[triangle]
-        a, b, c = (at[:, i].T for i in range(3))
-        return tuple((1 - beta - gamma) * a + beta * b + gamma * c)
-
-    smooth, flat = interpolated(meshes.normal), _cross(_columns(corners[:, 1]), _columns(corners[:, 2]))
-    met = jnp.where(_dot(flat, d) > 0, -1.0, 1.0) * jnp.where(_dot(flat, smooth) < 0, -1.0, 1.0)
-    inverse = met * jax.lax.rsqrt(jnp.maximum(_dot(smooth, smooth), _TINY))
-    return tuple(inverse * x for x in smooth), interpolated(meshes.texcoord)
+    at = (jnp.asarray(x, d[0].dtype)[triangle] for x in (meshes.triangle, meshes.normal, meshes.texcoord))
+    sides, normals, texcoords = map(_vectors, at)
+    normal, beta, gamma = facing(sides, normals, o, d)
+    return normal, interpolate(texcoords, beta, gamma)

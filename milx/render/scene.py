@@ -207,16 +207,15 @@ class Renderer:
         """Draws the image in one kernel of a GPU, without shadows; `interpret` runs the kernel anywhere, slowly.
 
         Raises:
-            ValueError: if a mesh is shown, which the kernel does not know.
+            ValueError: if a mesh shows a texture, which the kernel does not know.
         """
-        if self._meshes is not None:
-            raise ValueError(
-                f"geoms: got meshes, {len(self._meshes.triangle)} triangles, expected primitives; use render"
-            )
+        if self._images is not None:
+            raise ValueError("geoms: got meshes with textures, expected none; use render")
         from milx.render import kernel  # Pallas takes a quarter of a second to import
 
         texture = None if scene.texture is None else _in_camera(scene.texture, scene)
-        geoms = kernel.geom_table(self._model.geom_type, _geometry(scene), scene.geom_rgba, self._materials, texture)
+        looks = scene.geom_rgba, self._materials, texture, self._meshes
+        geoms = kernel.geom_table(self._model.geom_type, _geometry(scene), *looks)
         order: list[int] = []
         ranges = {}
         for kind, ids in self._groups.items():
@@ -224,7 +223,7 @@ class Renderer:
             order += ids.tolist()
         lights = kernel.light_table(self._lights(scene)[False])
         view = kernel.View(self.height, self.width, self._tangent, self._near, self._far)
-        return kernel.paint(geoms[np.array(order)], lights, ranges, view, interpret)
+        return kernel.paint(geoms[np.array(order)], lights, ranges, view, self._meshes, interpret)
 
     def _in_shadow(self, maps, visible, point, path, w) -> jax.Array:
         """Tells whether a geom stands between the points and a light: [P] bool."""

@@ -89,6 +89,13 @@ def test_every_mesh_has_its_own_texture_and_bare_ones_keep_their_color():
     assert color[geom == 1].std(axis=0).min() > 0.02
 
 
+def test_the_kernel_refuses_textures():
+    model, data = square({"noise": np.zeros((1, 1, 3), np.uint8)}, [("noise", "seen", [0, 0, 0])])
+    renderer = Renderer(model, "eye", 16, 16)
+    with pytest.raises(ValueError, match="geoms: got meshes with textures, expected none; use render"):
+        renderer.paint(renderer.scene(data), interpret=True)
+
+
 def test_without_a_texture_nothing_is_kept():
     model, _ = square({"noise": np.zeros((1, 1, 3), np.uint8)}, [("noise", "bare", [0, 0, 0])])
     assert images.of_model(model, np.arange(1)) is None

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from milx.render import Renderer, meshes
+from milx.render.scene import to_uint8
 
 HEIGHT, WIDTH = 40, 52
 TO_LIGHTS = np.array([[0.0, -1.0, 0.0], [0.6, 0.0, 0.8], [-0.6, 0.0, 0.8]])
@@ -124,7 +125,7 @@ def test_rays_find_the_nearest_of_all_triangles(least):
     nodes.add(np.concatenate([corners[:60], normals[:60]], axis=-1))
     second = len(nodes.box)
     nodes.add(np.concatenate([corners[60:], normals[60:]], axis=-1))
-    tables = nodes.arrays(np.array([0, second], np.int32))
+    tables = nodes.arrays(np.array([0, second], np.int32), np.ones(2))
     find = jax.jit(functools.partial(meshes.meet, tables, least=least))
     o = rng.normal(size=(300, 3))
     o *= 3 / np.linalg.norm(o, axis=1, keepdims=True)
@@ -161,7 +162,7 @@ def test_normals_are_interpolated_on_the_side_that_a_ray_meets(at, expected, tur
     corners, nodes = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), meshes._Nodes()
     texcoord = [[0.0, 0.0], [2.0, 0.0], [1.0, 3.0]]
     nodes.add(np.concatenate([corners, turned * np.array(at), texcoord], axis=-1)[None])
-    tables = nodes.arrays(np.zeros(1, np.int32))
+    tables = nodes.arrays(np.zeros(1, np.int32), np.ones(1))
     surface = lambda o, d: meshes.surface(tables, jnp.zeros(1, jnp.int32), o, d)  # noqa: E731
     rays = [tuple(jnp.full(1, x) for x in ray) for ray in ((0.3, 0.2, height), (0.0, 0.0, -height))]
     found, place = (np.ravel(x) for x in surface(*rays))
@@ -208,8 +209,25 @@ def test_a_ball_of_triangles_is_lit_as_a_ball_and_shades_only_what_lies_behind_i
     assert (aside < 0.97).sum() > 10 and (aside > 1.03).sum() > 100
 
 
-def test_the_kernel_refuses_meshes():
+@pytest.mark.parametrize("seed", range(2))
+def test_the_kernel_paints_meshes_as_the_reference_renders_them(seed):
+    """Beside primitives that hide them and are hidden; the image is no multiple of the kernel's tile."""
+    model, data = ready(robot(seed))
+    renderer = Renderer(model, "eye", HEIGHT, WIDTH)
+    scene = renderer.scene(data)
+    painted = np.asarray(jax.jit(lambda scene: renderer.paint(scene, interpret=True))(scene)).astype(int)
+    frame = jax.jit(renderer.render)(scene)
+    meshes_seen = np.isin(frame.geom_id, np.flatnonzero(model.geom_type == int(mujoco.mjtGeom.mjGEOM_MESH)))
+    assert meshes_seen.mean() > 0.05
+    off = np.abs(painted - np.asarray(to_uint8(frame.color)).astype(int)).max(axis=-1)
+    # Rounding may turn a pixel over where two triangles meet.
+    assert (off > 1).mean() < 2e-3
+    assert (off[meshes_seen] > 1).mean() < 1e-2
+
+
+def test_the_kernel_is_a_triton_program_with_meshes_too():
+    """Lowers it for a GPU, which needs none: what Triton does not know fails here."""
     model, data = ready(robot(0))
-    renderer = Renderer(model, "eye", 16, 16)
-    with pytest.raises(ValueError, match=r"geoms: got meshes, \d+ triangles, expected primitives"):
-        renderer.paint(renderer.scene(data), interpret=True)
+    renderer = Renderer(model, "eye", HEIGHT, WIDTH)
+    lowered = jax.jit(renderer.paint).trace(renderer.scene(data)).lower(lowering_platforms=("cuda",))
+    assert lowered.as_text().count("__gpu$xla.gpu.triton") == 1
