@@ -19,7 +19,7 @@ from milx.types import SPLITS
 def main(config: Config, workdir: str) -> None:
     """Writes train.npz, validation.npz and test.npz."""
     check_config(config)
-    env = envs.make(config.env_name, config.env.image_shape, config.env.action_cost)
+    env = envs.of_config(config)
     from milx.training.simulated import demos_of_split  # needs MuJoCo, of which `make` says if it is not there
 
     for split in SPLITS:

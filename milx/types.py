@@ -101,14 +101,14 @@ class Spec:
             the image, to those entries. It comes from the camera's calibration; None if that is unknown.
         object_indices: for each of the O objects the two indices of the entries of the state that hold its position,
             if the state contains them.
-        height_index: index of the entry of the state that holds the height of the hand, if policies without a
-            `goal_step` head for where it comes down; None otherwise.
+        height_index: index of the entry of the state that holds the height of the hand, in environments where the hand
+            must come down to an object; None otherwise.
         fps: time steps in a second of recorded demonstrations; None if it is not known.
         state_names: of the entries of the state; empty if they have none.
         action_names: of the entries of the action, likewise.
         class_indices: indices of the entries of the action that take two values, such as an open and a closed gripper.
-        goal_step: the time step of a demonstration at which the robot is at its goal; None if that is the last one, or
-            tells by its height.
+        goal_step: the time step of a demonstration at which the robot is at its goal; None where its height tells, or
+            where the goal is the end.
     """
 
     image_shape: ImageShape

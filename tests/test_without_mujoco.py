@@ -38,7 +38,8 @@ from milx.config.assemble import make_config
 from milx.training.factory import make_run
 
 for needs in (
-    lambda: milx.make("reach"), lambda: milx.load("push"), lambda: make_run(make_config("place", preset="cpu"), "run")
+    lambda: milx.make("reach"), lambda: milx.load("push"), lambda: make_run(make_config("place", preset="cpu"), "run"),
+    lambda: milx.make("grasp")
 ):
     try:
         needs()
@@ -48,7 +49,7 @@ for needs in (
     done = run(program)
     assert done.returncode == 0, done.stderr[-2000:]
     assert done.stdout.splitlines() == [
-        f"env: {name!r} needs MuJoCo: install milx with the extra 'sim'" for name in ("reach", "push", "place")
+        f"env: {name!r} needs MuJoCo: install milx with the extra 'sim'" for name in ("reach", "push", "place", "grasp")
     ]
     assert done.stderr == ""
 

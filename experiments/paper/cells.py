@@ -41,10 +41,11 @@ METHODS = {
     "reach_state": ("mil", "contextual", "lstm", "lstm_attention"),
     "push": ("mil", "contextual", "lstm"),
     "place": ("mil", "contextual", "lstm"),
+    "grasp": ("mil", "contextual", "lstm"),
 }
 """What is compared in each environment."""
 
-STEPS = {"reach": 12_000, "reach_state": 10_000, "push": 30_000, "place": 20_000}
+STEPS = {"reach": 12_000, "reach_state": 10_000, "push": 30_000, "place": 20_000, "grasp": 20_000}
 """Meta-updates of every method."""
 
 LEARNING_RATES = {
@@ -52,8 +53,10 @@ LEARNING_RATES = {
     "reach_state": {"mil": 3e-3, "contextual": 3e-3, "lstm": 3e-3, "lstm_attention": 3e-4},
     "push": {"mil": 3e-3, "contextual": 3e-4, "lstm": 3e-4},
     "place": {"mil": 3e-3, "contextual": 3e-4, "lstm": 3e-4},
+    "grasp": {"mil": 3e-3, "contextual": 3e-4, "lstm": 3e-4},
 }
-"""Peaks of the cosine, as `tune.py` found them on validation tasks; those of place, and of MIL on push, are reach's."""
+"""Peaks of the cosine, as `tune.py` found them on validation tasks; those of place and grasp, and of MIL on push, are
+reach's."""
 
 
 def methods_of(env: str, chosen: list[str] | None) -> list[str]:
@@ -278,8 +281,7 @@ class Cells:
         return self._once(("compiled", self._programs(config)), start)
 
     def _env(self, config: Config) -> envs.Env:
-        world = config.env_name, config.env.image_shape, config.env.action_cost
-        return self._once(("env", *world), lambda: envs.make(*world))
+        return self._once(("env", config.env_name, repr(config.env)), lambda: envs.of_config(config))
 
     def _programs(self, config: Config) -> str:
         """Describes all on which the compiled programs of training depend."""

@@ -4,8 +4,8 @@
     python experiments/paper/published.py --table=plateau --rows=released,whitened --seeds=1
     python experiments/paper/published.py --table=plateau --show --curves=docs/plateau.png
 
-The other tables are `small` (32x40 pixels), `baselines`, `ladder`, `relatives` and `experts`; `published_rows.py` says
-what each of their rows changes. Stopped and started again it goes on with its last checkpoint.
+The other tables are `small` (32x40 pixels), `baselines`, `ladder`, `relatives`, `experts` and `grasp`;
+`published_rows.py` says what each of their rows changes. Stopped and started again it goes on with its last checkpoint.
 """
 
 import pathlib

@@ -225,6 +225,7 @@ _RELATIVES = {env: _RESULTS[env] for env in ("reach", "push")} | {
 }
 
 _SAMPLING = {
+    "env.goal_step": 20,
     "data.expert": "sampling",
     "data.plan_iterations": 8,
     "data.plan_batch": 512,

@@ -32,10 +32,14 @@ class EnvConfig:
         action_cost: weight of the actions among the residuals whose squares the planner sums. With a lower weight the
             expert starts at once and moves fast, so its first actions show where it goes. None for the environment's
             own weight.
+        goal_step: the time step of a demonstration at which the robot is at the goal that a goal head learns to see
+            (`milx.data.goals`). None for the environment's own rule: in push where the hand comes down, and elsewhere
+            where the demonstration ends.
     """
 
     image_shape: tuple[int, int] = number((64, 80), 1, 4096)
     action_cost: float | None = number(None, 0)
+    goal_step: int | None = number(None, 1)
 
 
 @dataclasses.dataclass
@@ -53,8 +57,6 @@ class DataConfig:
         plan_iterations: iterations of trajectory optimization for a demonstration: with "ilqr" their maximum number, or
             0 to use the environment's controller instead; with "sampling" their number, 8 in the results that are
             reported; with "receding" their number in each of many plans, for which 1 is enough.
-        plan_update: how candidates change a plan with "sampling" and "receding": "predictive" sampling, "cross_entropy"
-            or "mppi" (`milx.trajopt.sampling`).
         plan_batch: demonstrations planned at once; by sampling each of them rolls out 64 plans at once.
     """
 
@@ -64,7 +66,6 @@ class DataConfig:
     spare_demos: int = number(0, 0, 1000)
     expert: str = "ilqr"
     plan_iterations: int = number(16, 0, 10_000)
-    plan_update: str = "cross_entropy"
     plan_batch: int = 4096
 
 

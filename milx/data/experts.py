@@ -13,7 +13,7 @@ from milx.config.schema import DataConfig
 from milx.core import platform, pytrees
 from milx.core.messages import warn
 from milx.envs.base import Env
-from milx.trajopt import expert, receding, sampling
+from milx.trajopt import expert, receding
 from milx.trajopt.expert import Sampling
 from milx.trajopt.ilqr import Options
 from milx.trajopt.planner import Plans, Settings, find_plans, share_plans
@@ -35,7 +35,7 @@ def expert_of(env: Env, config: DataConfig) -> Options | Sampling | receding.Set
     It says so if fewer than half of these plans succeed.
 
     Raises:
-        ValueError: for another name than those of EXPERTS, or sampling without an iteration or with an unknown update.
+        ValueError: for another name than those of EXPERTS, or sampling without an iteration.
     """
     if config.expert not in EXPERTS:
         raise ValueError(f"data.expert: got {config.expert!r}, expected one of {', '.join(EXPERTS)}")
@@ -45,12 +45,10 @@ def expert_of(env: Env, config: DataConfig) -> Options | Sampling | receding.Set
         raise ValueError(
             f"data.plan_iterations: got {config.plan_iterations}, expected at least 1 with {config.expert}"
         )
-    if config.plan_update not in sampling.UPDATES:
-        raise ValueError(f"data.plan_update: got {config.plan_update!r}, expected one of {', '.join(sampling.UPDATES)}")
-    changes: dict[str, Any] = {"iterations": config.plan_iterations, "update": config.plan_update}
     if config.expert == "receding":
-        return dataclasses.replace(RECEDING, search=dataclasses.replace(RECEDING.search, **changes))
-    search = dataclasses.replace(SETTINGS.search, **changes)
+        search = dataclasses.replace(RECEDING.search, iterations=config.plan_iterations)
+        return dataclasses.replace(RECEDING, search=search)
+    search = dataclasses.replace(SETTINGS.search, iterations=config.plan_iterations)
     return Sampling(dataclasses.replace(SETTINGS, search=search), _plans(env, SETTINGS, config.noise))
 
 
@@ -58,8 +56,8 @@ def description(env: Env, config: DataConfig) -> list:
     """Lists what decides, beside versions, what an expert plans."""
     settings: dict[str, list] = {
         "ilqr": [],
-        "sampling": ["sampling", config.plan_update, repr(SETTINGS)],
-        "receding": ["receding", config.plan_update, repr(RECEDING), env.ahead],
+        "sampling": ["sampling", repr(SETTINGS)],
+        "receding": ["receding", repr(RECEDING), env.ahead],
     }
     return [config.noise, config.plan_iterations, *settings[config.expert]]
 

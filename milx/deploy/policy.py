@@ -164,22 +164,6 @@ def read_spec(path: pathlib.Path) -> Spec:
         raise FileError(f"{path}: expected the sizes of a policy: {error}") from error
 
 
-def saved_spec(folder: pathlib.Path, config: Config) -> Spec:
-    """Reads the sizes of a run's policy; the first runs in simulation have no file of them, and no `goal_step`.
-
-    Raises:
-        FileError: as `read_spec`.
-    """
-    if (folder / SPEC_FILE).is_file():
-        return read_spec(folder / SPEC_FILE)
-    return dataclasses.replace(spec_of(config), goal_step=None)
-
-
-def spec_of(config: Config) -> Spec:
-    """Returns the sizes of a policy in the environment of a configuration."""
-    return envs.make(config.env_name, config.env.image_shape, config.env.action_cost).spec
-
-
 def load_run(run: str | pathlib.Path) -> Policy:
     """Loads the best policy of a run.
 
@@ -194,7 +178,7 @@ def load_run(run: str | pathlib.Path) -> Policy:
     if not path.is_file():
         raise ValueError(f"run: {folder} has no config.json, expected a folder written by `python -m milx.train`")
     config = assemble.read(path)
-    spec = saved_spec(folder, config)
+    spec = read_spec(folder / SPEC_FILE) if (folder / SPEC_FILE).is_file() else envs.of_config(config).spec
     method = methods.make(config, spec)
     checkpoints = Checkpoints(folder / "checkpoints", read_only=True)
     if checkpoints.best is None:

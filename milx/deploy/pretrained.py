@@ -1,10 +1,9 @@
 """Policies that ship with milx: `milx.load("push")`."""
 
-import dataclasses
 import pathlib
 from typing import Any
 
-from milx import methods
+from milx import envs, methods
 from milx.config import assemble
 from milx.config.registry import load_plugins
 from milx.core import files, pytrees
@@ -12,7 +11,6 @@ from milx.core.messages import warn
 from milx.deploy import policy
 from milx.deploy.policy import Policy
 from milx.methods import params_like
-from milx.types import Spec
 
 FOLDER = pathlib.Path(__file__).parent / "weights"
 FORMAT = 1
@@ -53,8 +51,7 @@ def load(run: str | pathlib.Path) -> Policy:
         got = f"got format {number!r:.100}, expected {FORMAT}"
         raise files.FileError(f"{_path(str(run), 'result.json')}: {got}: it may be of a later milx")
     config = assemble.from_dict(reached["config"])
-    spec = policy.spec_of(config)
-    spec = Spec.from_dict(reached["spec"]) if "spec" in reached else dataclasses.replace(spec, goal_step=None)
+    spec = envs.of_config(config).spec
     method = methods.make(config, spec)
     path = _path(str(run), "params.npz")
     params = pytrees.read(path, like=params_like(method, spec))
@@ -73,8 +70,7 @@ def save(trained: Policy, reached: dict[str, Any], folder: pathlib.Path) -> None
     """
     pytrees.write(folder / "params.npz", trained.params)
     digest = pytrees.fingerprint(trained.params)
-    also = {"format": FORMAT, "params_hash": digest, "spec": trained.spec.to_dict()}
-    files.write_json(folder / "result.json", reached | also)
+    files.write_json(folder / "result.json", reached | {"format": FORMAT, "params_hash": digest})
 
 
 def _path(name: str, file: str) -> pathlib.Path:

@@ -4,6 +4,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from milx.config.registry import ENVS, register_env_at
+from milx.config.schema import Config
 from milx.envs.grasp.presets import GRASP
 from milx.envs.place.presets import PLACE, PLACE_DURATIONS
 from milx.envs.push.presets import PUSH, PUSH_DURATIONS
@@ -31,6 +32,17 @@ def find(name: str) -> "type[Env]":
     if name not in ENVS:
         raise ValueError(f"env: got {name!r}, expected one of {', '.join(ENVS)}")
     return ENVS[name]
+
+
+def of_config(config: Config) -> "Env":
+    """Builds the environment of a configuration.
+
+    Raises:
+        ValueError: as `find`.
+    """
+    env = make(config.env_name, config.env.image_shape, config.env.action_cost)
+    env.goal_step = config.env.goal_step
+    return env
 
 
 def make(name: str, image_shape: tuple[int, int] | None = None, action_cost: float | None = None) -> "Env":

@@ -30,10 +30,9 @@ class Env(World[TaskT]):
         horizon: T, actions in an episode.
         criterion: what counts as success, in words, for result files.
         goal_indices: entries of the robot's state that tell where it is heading (`milx.data.goals`).
-        goal_step: the time step at which the robot is at its goal, in environments where it handles something on the
-            way; None where the goal is where it ends.
-        height_index: the entry that tells how high its hand is, where policies without a `goal_step`, as they were made
-            once, head for where it comes down; None otherwise.
+        height_index: the entry that tells how high its hand is, where it must come down to an object; None otherwise.
+        goal_step: the time step of a demonstration at which the robot is at its goal; None where its height tells, or
+            where the goal is the end. A configuration sets it (`env.goal_step`).
         object_indices: for each of the O objects, the two entries of the state that hold its position, where the state
             tells it.
         tactics: ways in which the controller may go about a scene, in the order of preference; what the numbers mean is
@@ -51,8 +50,8 @@ class Env(World[TaskT]):
     horizon: int
     criterion: str
     goal_indices: tuple[int, ...] = ()
-    goal_step: int | None = None
     height_index: int | None = None
+    goal_step: int | None = None
     object_indices: tuple[tuple[int, ...], ...] = ()
     tactics: tuple[float, ...] = (0.0,)
     long_chain: bool = True

@@ -35,14 +35,13 @@ def render(
         width: of an image, in pixels.
         mjx_model: whose sizes, colors and lights count, see `Renderer.scene`; those of `model` by default.
         shadows: whether lights with `castshadow` throw hard shadows.
-        max_triangles: to how many, about, a mesh with more is simplified; None to keep them all.
+        max_triangles: to how many a mesh with more is simplified, as for `Renderer`; None to keep them all.
 
     Returns:
         The frame; of several cameras, all its arrays have a leading axis of them, in the order given.
 
     Raises:
-        ValueError: no camera is given, or one that does not exist, or the model asks for what cannot be shown.
-        ImportError: for `max_triangles` without the extra "meshes".
+        ValueError: no camera is given, or as `Renderer`.
     """
     if isinstance(camera, str | int):
         renderer = Renderer(model, camera, height, width, shadows=shadows, max_triangles=max_triangles)

@@ -2,8 +2,9 @@
 
 At the coordinates (s, t) of a surface a texture of h rows and w columns shows the bilinear interpolation of its texels,
 of which row i and column j lies at s = (j + 1/2) / w and t = (i + 1/2) / h. It repeats itself with a period of 1 in
-both directions, and multiplies the color of the geom, as in MuJoCo. There is no smaller version of a texture for where
-it is seen from far away, so that fine ones flicker there.
+both directions, and multiplies the color of the geom. MuJoCo's renderer differs in what follows: it multiplies
+highlights, too, takes textures in sRGB (`colorspace`) for what they are, shows no textures of one channel, and has
+smaller versions of a texture for where it is seen from far away, where fine ones flicker here.
 """
 
 from typing import NamedTuple
@@ -20,7 +21,7 @@ class Images(NamedTuple):
     """The textures of a model, one after the other, and which one a geom has; G geoms, P pixels.
 
     Attributes:
-        texel: [N, 3] RGB in [0, 1], row by row.
+        texel: [N, 3] uint8 RGB, row by row.
         begin: [G] int32, the first texel of a geom's texture.
         size: [G, 2] int32, h and w; zero for geoms without a texture.
     """
@@ -59,7 +60,7 @@ def _texture(model: mujoco.MjModel, geom: int) -> int | None:
 def _texels(model: mujoco.MjModel, texture: int) -> np.ndarray:
     channels, first = model.tex_nchannel[texture], model.tex_adr[texture]
     count = model.tex_height[texture] * model.tex_width[texture]
-    values = model.tex_data[first : first + channels * count].reshape(count, channels) / 255
+    values = model.tex_data[first : first + channels * count].reshape(count, channels)
     return np.broadcast_to(values, (count, 3)) if channels == 1 else values[:, :3]
 
 
@@ -75,14 +76,14 @@ def mix(images: Images, rgb: Vector, geom_id: jax.Array, texcoord: Vector) -> Ve
     Returns:
         Three [P] arrays.
     """
-    texel = jnp.asarray(images.texel, rgb[0].dtype)
+    texel = jnp.asarray(images.texel)
     begin, (height, width) = jnp.asarray(images.begin)[geom_id], jnp.asarray(images.size)[geom_id].T
     rows, columns = jnp.maximum(height, 1), jnp.maximum(width, 1)
     x, y = texcoord[0] * columns - 0.5, texcoord[1] * rows - 0.5
     left, top = jnp.floor(x), jnp.floor(y)
-    shown = jnp.zeros((*x.shape, 3), texel.dtype)
+    shown = jnp.zeros((*x.shape, 3), x.dtype)
     for down, across in ((0, 0), (0, 1), (1, 0), (1, 1)):
         weight = jnp.where(down, y - top, 1 - y + top) * jnp.where(across, x - left, 1 - x + left)
         row, column = (top.astype(jnp.int32) + down) % rows, (left.astype(jnp.int32) + across) % columns
-        shown += weight[:, None] * texel[begin + row * columns + column]
+        shown += weight[:, None] * texel[begin + row * columns + column] / 255
     return tuple(jnp.where(height > 0, color * shown[:, i], color) for i, color in enumerate(rgb))

@@ -61,10 +61,10 @@ class Meshes(NamedTuple):
 
 
 def of_model(model: mujoco.MjModel, geoms: np.ndarray, most: int | None = None) -> Meshes:
-    """Builds the hierarchies of the meshes of some geoms, each mesh once, and of `most` triangles at most, about.
+    """Builds the hierarchies of the meshes of some geoms, each mesh once; those of more than `most` triangles of fewer.
 
     Raises:
-        ImportError: as `decimate.decimate`.
+        ValueError: as `decimate.decimate`.
     """
     root, radius, nodes = np.zeros(model.ngeom, np.int32), np.zeros(model.ngeom), _Nodes()
     of_mesh: dict[int, tuple[int, float]] = {}

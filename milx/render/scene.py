@@ -88,15 +88,16 @@ class Renderer:
             height: of the image, in pixels.
             width: of the image, in pixels.
             shadows: whether lights with `castshadow` throw hard shadows; each costs about as much as all the rest.
-            max_triangles: to how many, about, a mesh with more is simplified (`decimate.py`); None to keep them all.
+            max_triangles: to how many larger meshes are simplified, as far as `decimate.py` can; None to keep all.
 
         Raises:
-            ValueError: there is no such camera, or the model asks for what this renderer cannot show.
-            ImportError: for `max_triangles` without the extra "meshes".
+            ValueError: there is no such camera, or the model asks for what cannot be shown, or as `decimate.decimate`.
         """
-        for name, value in (("height", height), ("width", width), ("max_triangles", max_triangles)):
-            if value is not None and value < 1:
-                raise ValueError(f"{name}={value!r}: expected at least 1")
+        for name, value in (("height", height), ("width", width)):
+            if value < 1:
+                raise ValueError(f"{name}={value!r}: expected at least 1 pixel")
+        if max_triangles is not None and max_triangles < 4:
+            raise ValueError(f"max_triangles={max_triangles!r}: expected at least 4, or None")
         self.height, self.width = height, width
         self._model = model
         self._near, self._far = (float(edge * model.stat.extent) for edge in (model.vis.map.znear, model.vis.map.zfar))

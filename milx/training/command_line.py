@@ -118,6 +118,9 @@ def parse(argv: Sequence[str], values: flags.FlagValues = FLAGS) -> list[str]:
         preset = values.preset or ("cpu" if jax.default_backend() == "cpu" else "fast")
         if values.data is None and values.env == RECORDED:
             raise flags.Error(f"--env: got {RECORDED!r}, expected --data=FOLDER, the folder of the demonstrations")
+        if values.data is None and values.preset is None and preset not in PRESETS.get(values.env, [preset]):
+            known = ", ".join(PRESETS[values.env])
+            raise flags.Error(f"--preset: got none, expected one of {known}: {values.env} has none for this device")
         if values.data is None:
             config = assemble.make_config(values.env, values.method, preset, values.seed)
         else:

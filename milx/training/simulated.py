@@ -17,10 +17,9 @@ from rich.console import Console
 from milx import envs
 from milx.config.check import check_config
 from milx.config.schema import Config, EvalConfig
-from milx.core import files, parallel, platform, pytrees
+from milx.core import parallel, platform, pytrees
 from milx.data import simulated as demos_lib
 from milx.data.simulated import DemoSet
-from milx.deploy.policy import saved_spec
 from milx.envs.base import State, Task
 from milx.evaluation import closed_loop, plots
 from milx.evaluation.closed_loop import Trials
@@ -29,7 +28,7 @@ from milx.methods.random import Random
 from milx.training.metrics import read_metrics
 from milx.training.run import Run
 from milx.training.state import Training
-from milx.types import SPEC_FILE, SPLITS, Params
+from milx.types import SPLITS, Params
 
 EVALUATION_SEED = 2017
 """Validation and test tasks and their trials are the same for every seed of a run."""
@@ -161,14 +160,10 @@ class SimulatedRun(Run):
         if config.data.demos_per_task <= config.train.shots:
             expected = f"more than train.shots = {config.train.shots}: another one is the query"
             raise ValueError(f"data.demos_per_task: got {config.data.demos_per_task}, expected {expected}")
-        self.env = envs.make(config.env_name, config.env.image_shape, config.env.action_cost)
-        if (pathlib.Path(workdir) / "checkpoints").is_dir():  # a run goes on with the goals with which it began
-            self.env.goal_step = saved_spec(pathlib.Path(workdir), config).goal_step
+        self.env = envs.of_config(config)
         self._demonstrations: dict[str, dict[str, float]] = {}
         sample = demos_lib.sampler(self.env, config.train)
         super().__init__(config, self.env.spec, sample, workdir, console)
-        if not (path := self.folder / SPEC_FILE).is_file():
-            files.write_json(path, self.spec.to_dict())
 
     def demos(self, split: str) -> DemoSet:
         """Returns the demonstrations of a split, planned or from the cache of earlier runs."""

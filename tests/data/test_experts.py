@@ -35,10 +35,6 @@ def env():
             {"expert": "receding", "plan_iterations": 0},
             "data.plan_iterations: got 0, expected at least 1 with receding",
         ),
-        (
-            {"expert": "receding", "plan_update": "elites"},
-            "data.plan_update: got 'elites', expected one of predictive, cross_entropy, mppi",
-        ),
     ],
 )
 def test_what_no_expert_understands_is_refused(env, changes, message):
@@ -51,16 +47,15 @@ def test_ilqr_has_the_iterations_of_the_settings(env):
     assert experts.description(env, DataConfig(noise=0.2, plan_iterations=7)) == [0.2, 7]
 
 
-def test_a_receding_horizon_has_the_iterations_and_the_update_of_the_settings(env):
-    expert = experts.expert_of(env, DataConfig(expert="receding", plan_iterations=3, plan_update="mppi"))
-    assert expert == receding.Settings(search=dataclasses.replace(receding.SEARCH, iterations=3, update="mppi"))
+def test_a_receding_horizon_has_the_iterations_of_the_settings(env):
+    expert = experts.expert_of(env, DataConfig(expert="receding", plan_iterations=3))
+    assert expert == receding.Settings(search=dataclasses.replace(receding.SEARCH, iterations=3))
 
 
 def test_all_that_decides_on_demonstrations_by_sampling_describes_them(env, monkeypatch):
     config = DataConfig(expert="sampling", plan_iterations=4)
     described = [experts.description(env, config)]
-    others = {"noise": 0.3}, {"plan_iterations": 5}, {"plan_update": "mppi"}
-    for changes in ({"expert": "ilqr"}, {"expert": "receding"}, *others):
+    for changes in ({"expert": "ilqr"}, {"expert": "receding"}, {"noise": 0.3}, {"plan_iterations": 5}):
         described.append(experts.description(env, dataclasses.replace(config, **changes)))
     monkeypatch.setattr(experts, "SETTINGS", FEW)
     described.append(experts.description(env, config))

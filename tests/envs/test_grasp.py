@@ -7,12 +7,14 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+import planned
 import pytest
 
 from milx.core.mjx import mjx
 from milx.envs.grasp import env as grasp
 from milx.envs.grasp.env import Grasp
 from milx.envs.shapes import BY_SPLIT, SHAPES
+from milx.trajopt.expert import VERSION
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -265,3 +267,15 @@ def test_calibration_tells_where_in_the_image_a_mat_lies(tasks, starts):
         errors.append(np.linalg.norm(center @ env.image_to_goal - spot))
     # A pixel is about 7 mm; the camera looks down at an angle, which an affine map fits over the shelf.
     assert np.max(errors) < 0.02
+
+
+def test_what_is_planned_is_what_its_version_says(env, tasks, starts, shown):
+    """Looks at tasks, scenes, costs and controls, and at the way of the hand to the things."""
+    steering = env.steering
+    control = 0.5 * steering.deviation
+    action = jax.vmap(lambda start: steering.action(start, control))(starts)
+    cost = jax.vmap(env.running_residual, in_axes=(0, 0, 0, None))
+    numbers = [np.ravel(x) for x in jax.tree.leaves(first((tasks, starts)))]
+    numbers += [np.ravel(cost(tasks, starts, action, time)[:4]) for time in (0, env.horizon - 1)]
+    numbers += [action[0], steering.low, steering.high, steering.deviation, np.ravel(shown.qpos[0, [5, 15]])]
+    planned.check("grasp", [env.version, VERSION], np.concatenate(numbers), atol=1e-5)

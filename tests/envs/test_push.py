@@ -163,7 +163,7 @@ def test_the_goal_of_a_demonstration_lies_behind_its_target_until_it_is_pushed(e
     """Compares what the goal head is to see: a place near the target, farther from the disc than the target is."""
     tasks, states, _ = shown
     robot = jax.jit(jax.vmap(jax.vmap(env.robot_state)))(states)
-    goal = jax.vmap(lambda state: goals(state, env.goal_indices, step=env.goal_step))(robot)[:, 0]
+    goal = jax.vmap(lambda state: goals(state, env.goal_indices, env.height_index))(robot)[:, 0]
     place = jax.vmap(env.objects)(jax.tree.map(lambda x: x[:, 0], states))[..., :2]
     rows = np.arange(len(goal))
     target, other = place[rows, tasks.target], place[rows, 1 - tasks.target]

@@ -10,6 +10,7 @@ import pytest
 sys.path.insert(0, str(pathlib.Path(__file__).parents[2] / "experiments" / "paper"))
 import cells
 import figure3
+import grasp
 import pages
 import published
 import published_rows
@@ -35,7 +36,9 @@ def test_a_point_is_the_mean_of_its_seeds_within_all_their_intervals():
     assert curves["reach", "lstm"][500] == pytest.approx((0.1, 0.0, 0.2, 1))
 
 
-@pytest.mark.parametrize("table", [table1.TABLE, table2.TABLE, table3.TABLE], ids=["table1", "table2", "table3"])
+@pytest.mark.parametrize(
+    "table", [each.TABLE for each in (table1, table2, table3, grasp)], ids=lambda each: each.folder
+)
 def test_rows_are_trained_once_for_all_shots_and_each_on_its_own(table, tmp_path, flags):
     spec, runner, programs = envs.make(table.env, (48, 48)).spec, cells.Cells(tmp_path, 1), set()
     for row in table.rows.values():
@@ -112,12 +115,13 @@ def test_the_ladder_ends_with_fast(env):
     assert config == make_config(env, preset="fast", seed=0)
 
 
-def test_demonstrations_by_sampling_are_all_that_their_row_changes_of_fast():
+def test_demonstrations_by_sampling_and_their_goals_are_all_that_their_row_changes_of_fast():
     row = published_rows.TABLES["experts"]["push-sampling"]
     config = dataclasses.replace(published_rows.configure(row, 1, seed=0), preset="fast")
     fast = make_config("push", preset="fast", seed=0)
     evaluation = dataclasses.replace(fast.evaluation, baseline_trials=1)
-    assert config == dataclasses.replace(fast, data=config.data, evaluation=evaluation)
+    assert config == dataclasses.replace(fast, env=config.env, data=config.data, evaluation=evaluation)
+    assert config.env == dataclasses.replace(fast.env, goal_step=20)
     planned = {"expert": "sampling", "plan_iterations": 8, "plan_batch": 512}
     assert config.data == dataclasses.replace(fast.data, **planned)
 

@@ -112,7 +112,7 @@ def test_an_unknown_camera_is_named_in_the_error(model, camera):
 
 
 def test_an_empty_image_is_refused(model):
-    with pytest.raises(ValueError, match="width=0: expected at least 1"):
+    with pytest.raises(ValueError, match="width=0: expected at least 1 pixel"):
         Renderer(model, "fixed", 8, 0)
 
 

@@ -13,16 +13,13 @@ from tiny import QUIET, tiny_config
 import milx
 from milx import methods
 from milx.config import assemble
-from milx.config.assemble import make_config
 from milx.core import pytrees
 from milx.core.checkpoint import Checkpoints
-from milx.deploy.policy import read_spec
 from milx.methods import params_like
 from milx.networks import fixed_filters
 from milx.training.metrics import MetricsWriter
 from milx.training.simulated import SimulatedRun, training_on
 from milx.training.state import initial_state
-from milx.types import SPEC_FILE
 
 RESULT_FIELDS = {
     *("env", "method", "preset", "variant", "seed", "num_tasks_train", "num_demos_train", "shots", "given"),
@@ -203,18 +200,3 @@ def test_evaluation_is_a_result_file(trained):
     assert set(clock) == {"demos", "compile", "train", "evaluate", "total"}
     parts = sum(seconds for name, seconds in clock.items() if name != "total")
     assert 0.5 * clock["total"] < parts <= clock["total"] * 1.001
-
-
-def test_a_run_in_simulation_keeps_the_goals_with_which_it_began(tmp_path):
-    """The first runs have no file of their policy's sizes; push headed for where the hand comes down then."""
-    config = make_config("push", preset="cpu")
-    new = SimulatedRun(config, tmp_path / "new", QUIET)
-    assert read_spec(new.folder / SPEC_FILE) == new.spec == new.env.spec
-    assert new.spec.goal_step == new.env.goal_step > 0
-    (tmp_path / "old" / "checkpoints").mkdir(parents=True)
-    old = SimulatedRun(config, tmp_path / "old", QUIET)
-    assert old.env.goal_step is None
-    assert old.spec == dataclasses.replace(new.spec, goal_step=None) == read_spec(old.folder / SPEC_FILE)
-    for run in (new, old):
-        again = SimulatedRun(config, run.folder, QUIET)
-        assert again.spec == again.env.spec == run.spec

@@ -91,7 +91,6 @@ class Push(Env[PushTask]):
     criterion = f"centre on the goal disc for at least {STEPS_ON_GOAL} of 100 steps"
     state_size = 20
     goal_indices = (14, 15)
-    goal_step = 20
     height_index = 16
     tactics = (0.0, 0.02, -0.02)
     action_cost = 0.1
@@ -259,10 +258,10 @@ class Push(Env[PushTask]):
         return jnp.clip(torque / self.mj_model.actuator_gear[:, 0], *self.action_range)
 
     def running_residual(self, task: PushTask, state: State, action: jax.Array, t: jax.Array) -> jax.Array:
-        """Returns [12]: how far the object is from the goal, the tip from the object, and how high (m), and the action.
+        """Returns [12]: object from goal, tip from object, the tip's height (m), and the action; weighted.
 
-        They are weighted. The squares of their norms are the terms of the released code's reward, without its roots,
-        and a height at which the hand pushes, since no table holds it up.
+        The released code's reward has the norms of the first two and of the action instead of their squares. The height
+        is measured from that at which the hand pushes, since no table holds it up.
         """
         place, tip = self.objects(state)[task.target, :2], self.hand(state.qpos)[:3]
         height = HEIGHT_COST * (tip[2:] - PUSH_HEIGHT)
