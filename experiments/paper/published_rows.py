@@ -232,8 +232,14 @@ _SAMPLING = {
     "evaluation.baseline_trials": 1,
 }
 _LADDER = _ladder()
+_SAMPLED = _LADDER["push-fast"].changes | _SAMPLING
 _EXPERTS = {
-    "push-sampling": Row("push: `fast`, demonstrations by sampling", "push", _LADDER["push-fast"].changes | _SAMPLING)
+    "push-sampling": Row("push: `fast`, by sampling", "push", _SAMPLED),
+    "push-sampling-beginning": Row(
+        "push: `fast`, by sampling, more of the beginning",
+        "push",
+        _SAMPLED | {"train.frame_exponent": 2.0},
+    ),
 }
 
 TABLES: dict[str, dict[str, Row]] = {
