@@ -1,8 +1,15 @@
 """Where a demonstration leads, worked out by hand."""
 
+import dataclasses
+
+import jax
+import jax.numpy as jnp
 import numpy as np
 
+from milx import envs
+from milx.config.assemble import make_config
 from milx.data.goals import goals, with_goals
+from milx.data.simulated import render_demo
 from milx.types import Demo
 
 #                  x    y    height
@@ -36,3 +43,22 @@ def test_goals_are_added_to_one_demonstration_or_to_several():
     np.testing.assert_array_equal(with_goals(demo, (0, 1), step=2).goal, goals(STATE, (0, 1), step=2))
     assert with_goals(demo, ()).goal is None
     assert with_goals(Demo(action=STATE), (0, 1)).goal is None
+
+
+def test_a_configuration_says_at_which_step_the_robot_is_at_its_goal():
+    """Moves the arm of a run's environment evenly, and labels what it shows as a policy of that run does."""
+    config = make_config("reach_state", preset="cpu")
+    assert envs.of_config(config).spec.goal_step is None
+    config.env.goal_step = 2
+    env, key = envs.of_config(config), jax.random.key(0)
+    task = env.sample_task(key, "train")
+    start = env.reset(key, task)
+    moved = [dataclasses.replace(start, qpos=start.qpos + 0.1 * t) for t in range(6)]
+    states = jax.tree.map(lambda *each: jnp.stack(each), *moved)
+    demo = render_demo(env, task, states, jnp.zeros((5, env.action_size)))
+    place = demo.state[:, jnp.array(env.goal_indices)]
+    assert np.abs(place[1] - place[2]).max() > 0.01
+    np.testing.assert_allclose(demo.goal, np.where(np.arange(5)[:, None] < 2, place[2], np.nan), atol=1e-7)
+    spec = env.spec
+    same = with_goals(demo, spec.goal_indices, spec.height_index, spec.goal_step)
+    np.testing.assert_array_equal(same.goal, demo.goal)
