@@ -29,6 +29,7 @@ TITLES = {
     "reach_state": "state, held-out scenes",
     "push": "push, held-out objects and textures",
     "place": "place, held-out objects and textures",
+    "grasp": "grasp, held-out objects and textures",
 }
 
 flags.adopt_module_key_flags(options)

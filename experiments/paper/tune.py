@@ -26,7 +26,7 @@ CANDIDATES = {
 }
 """Learning rate, and whether it decays to zero along a cosine."""
 
-STEPS = {"reach": 8_000, "reach_state": 5_000, "push": 10_000, "place": 10_000}
+STEPS = {"reach": 8_000, "reach_state": 5_000, "push": 10_000, "place": 10_000, "grasp": 10_000}
 """Meta-updates of every run, fewer than in figure 3."""
 
 flags.adopt_module_key_flags(options)
@@ -39,7 +39,7 @@ def configure(env: str, method: str, candidate: str) -> Config:
     config = cells.configure(env, method, options.PRESET.value, seed=0, steps=options.STEPS.value or STEPS[env])
     config.optimizer.learning_rate, config.optimizer.cosine = CANDIDATES[candidate]
     config.train.eval_every = config.train.steps
-    config.train.redraw = env in ("push", "place")  # as in their tables
+    config.train.redraw = env in ("push", "place", "grasp")  # as in their tables
     return config
 
 

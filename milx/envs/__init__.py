@@ -41,7 +41,8 @@ def of_config(config: Config) -> "Env":
         ValueError: as `find`.
     """
     env = make(config.env_name, config.env.image_shape, config.env.action_cost)
-    env.goal_step = config.env.goal_step
+    if config.env.goal_step is not None:
+        env.goal_step = config.env.goal_step
     return env
 
 

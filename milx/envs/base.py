@@ -32,7 +32,7 @@ class Env(World[TaskT]):
         goal_indices: entries of the robot's state that tell where it is heading (`milx.data.goals`).
         height_index: the entry that tells how high its hand is, where it must come down to an object; None otherwise.
         goal_step: the time step of a demonstration at which the robot is at its goal; None where its height tells, or
-            where the goal is the end. A configuration sets it (`env.goal_step`).
+            where the goal is the end. A configuration may override it (`env.goal_step`).
         object_indices: for each of the O objects, the two entries of the state that hold its position, where the state
             tells it.
         tactics: ways in which the controller may go about a scene, in the order of preference; what the numbers mean is

@@ -1,6 +1,6 @@
 """The same image in one GPU kernel: rays, nearest hit and lighting of a tile of pixels, without leaving the registers.
 
-The arithmetic is that of `raycast`, `normals` and `shade`, the readable reference; this file only arranges it for
+The arithmetic is that of `raycast`, `meshes`, `normals` and `shade`, the readable reference; this file arranges it for
 Pallas. A tile of pixels passes over every geom whose bounding ball lies outside the pyramid that the tile sees. Through
 the hierarchy of a mesh its pixels go together: into every node that one of them enters.
 """

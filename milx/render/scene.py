@@ -208,10 +208,10 @@ class Renderer:
         """Draws the image in one kernel of a GPU, without shadows; `interpret` runs the kernel anywhere, slowly.
 
         Raises:
-            ValueError: if a mesh shows a texture, which the kernel does not know.
+            ValueError: if shadows are to fall, or a mesh shows a texture, which the kernel does not know.
         """
-        if self._images is not None:
-            raise ValueError("geoms: got meshes with textures, expected none; use render")
+        if self._shadows or self._images is not None:
+            raise ValueError("got shadows, or meshes with textures, expected neither: use render")
         from milx.render import kernel  # Pallas takes a quarter of a second to import
 
         texture = None if scene.texture is None else _in_camera(scene.texture, scene)

@@ -45,10 +45,13 @@ def test_goals_are_added_to_one_demonstration_or_to_several():
     assert with_goals(Demo(action=STATE), (0, 1)).goal is None
 
 
-def test_a_configuration_says_at_which_step_the_robot_is_at_its_goal():
+def test_a_configuration_says_at_which_step_the_robot_is_at_its_goal(monkeypatch):
     """Moves the arm of a run's environment evenly, and labels what it shows as a policy of that run does."""
     config = make_config("reach_state", preset="cpu")
     assert envs.of_config(config).spec.goal_step is None
+    with monkeypatch.context() as patch:
+        patch.setattr(envs.find("reach_state"), "goal_step", 7)
+        assert envs.of_config(config).spec.goal_step == 7, "the environment's own"
     config.env.goal_step = 2
     env, key = envs.of_config(config), jax.random.key(0)
     task = env.sample_task(key, "train")

@@ -48,14 +48,37 @@ def volume(corners):
 def test_a_ball_stays_round():
     few = decimate(ball(), 500)
     assert 400 < len(few) <= 500
-    place, normal = few[..., :3], few[..., 3:6] / np.linalg.norm(few[..., 3:6], axis=-1, keepdims=True)
+    place, normal = few[..., :3], few[..., 3:6]
     radius = np.linalg.norm(place, axis=-1)
     np.testing.assert_allclose(radius, 1.0, rtol=0, atol=0.02)
-    # What is linear in the place, as the normals of a ball and the coordinates x and y are, is continued exactly but
-    # for the height over the old triangle's plane, at most 1 - cos(0.25) within a new triangle's reach of 0.25.
-    assert (np.einsum("fci,fci->fc", place, normal) / radius).min() > np.cos(0.06)
+    np.testing.assert_allclose(np.linalg.norm(normal, axis=-1), 1.0, rtol=0, atol=1e-6)
+    # The nearest old corner is less than an edge of 0.08 away, and faces within 45 degrees of the new triangle.
+    assert (np.einsum("fci,fci->fc", place, normal) / radius).min() > np.cos(0.09)
     np.testing.assert_allclose(volume(few), 4 / 3 * np.pi, rtol=0.02)
     np.testing.assert_allclose(few[..., 6:], place[..., :2], rtol=0, atol=0.05)
+
+
+def test_edges_that_are_rounded_off_with_slivers_do_not_turn_the_surface():
+    """A drum of 200 sides, whose rims are three rings of thin triangles that turn from its side to its top."""
+    count, rings = 200, [(1.0, 0.0)] + [(0.95 + 0.05 * np.cos(t), 0.95 + 0.05 * np.sin(t)) for t in (0, 0.5, 1.0, 1.57)]
+    normals = [(1.0, 0.0)] + [(np.cos(t), np.sin(t)) for t in (0, 0.5, 1.0, 1.57)]
+    rings, normals = [*rings, (0.0, 1.0)], [*normals, (0.0, 1.0)]
+    table = []
+    for i, j in itertools.product(range(count), range(len(rings) - 1)):
+        square = []
+        for k, m in ((i, j), (i + 1, j), (i + 1, j + 1), (i, j + 1)):
+            x, y = np.cos(2 * np.pi * k / count), np.sin(2 * np.pi * k / count)
+            (radius, z), (out, up) = rings[m], normals[m]
+            square.append([radius * x, radius * y, z, out * x, out * y, up, 0, 0])
+        table += [[square[0], square[1], square[2]], [square[0], square[2], square[3]]]
+    whole = np.array(table)
+    flat = np.cross(whole[:, 1, :3] - whole[:, 0, :3], whole[:, 2, :3] - whole[:, 0, :3])
+    few = decimate(whole[np.linalg.norm(flat, axis=1) > 1e-9], 700)
+    assert len(few) < 900
+    flat = np.cross(few[:, 1, :3] - few[:, 0, :3], few[:, 2, :3] - few[:, 0, :3])
+    area = np.linalg.norm(flat, axis=1)
+    cosine = np.einsum("fi,fci->fc", flat / np.maximum(area, 1e-30)[:, None], few[..., 3:6]).min(axis=1)
+    assert area[cosine < 0.7].sum() < 0.01 * area.sum()
 
 
 def test_seams_of_textures_stay_seams():
@@ -82,14 +105,17 @@ def test_seams_of_textures_stay_seams():
 
 
 def test_sheets_back_to_back_keep_their_sides():
-    flat = cube()
-    top = flat[flat[:, :, 2].min(axis=1) > 0.99]
-    bottom = top[:, ::-1].copy()
-    bottom[..., 5] = -1
-    few = decimate(np.concatenate([top, bottom]), 100)
-    assert len(few) < 2 * len(top)
-    np.testing.assert_allclose(np.abs(few[..., 5]), 1, atol=1e-9)
-    assert (np.ptp(few[..., 5], axis=1) == 0).all(), "the normals of a triangle agree"
+    """The top of a cube and, 1 cm below, another one of other triangles that faces down and has another texture."""
+    top, bottom = (whole[whole[:, :, 2].min(axis=1) > 0.99] for whole in (cube(24), cube(19)))
+    bottom = bottom[:, ::-1].copy()
+    bottom[..., 2] -= 0.01
+    bottom[..., 5:] = -1, 5, 5
+    few = decimate(np.concatenate([top, bottom]), 400)
+    assert len(few) < (len(top) + len(bottom)) / 2
+    flat = np.cross(few[:, 1, :3] - few[:, 0, :3], few[:, 2, :3] - few[:, 0, :3])
+    side = np.broadcast_to(np.sign(flat[:, None, 2]), few.shape[:2])
+    np.testing.assert_allclose(few[..., 5], side, atol=1e-9)
+    np.testing.assert_allclose(few[..., 6:], np.where(side[..., None] > 0, few[..., :2], 5), atol=1e-6)
 
 
 def test_a_cube_keeps_its_edges():

@@ -92,7 +92,7 @@ def test_every_mesh_has_its_own_texture_and_bare_ones_keep_their_color():
 def test_the_kernel_refuses_textures():
     model, data = square({"noise": np.zeros((1, 1, 3), np.uint8)}, [("noise", "seen", [0, 0, 0])])
     renderer = Renderer(model, "eye", 16, 16)
-    with pytest.raises(ValueError, match="geoms: got meshes with textures, expected none; use render"):
+    with pytest.raises(ValueError, match="got shadows, or meshes with textures, expected neither: use render"):
         renderer.paint(renderer.scene(data), interpret=True)
 
 
