@@ -63,7 +63,7 @@ def _nearest(old: np.ndarray, facing: np.ndarray, place: np.ndarray, wanted: np.
 
 
 def _continued(old: np.ndarray, place: np.ndarray, flat: np.ndarray) -> np.ndarray:
-    """Continues what old triangles [F, 3, C] have beside normals to the corners [F', 3, 3] of those that face `flat`."""
+    """Continues what old triangles [F, 3, C] have beside normals to corners [F', 3, 3] of those that face `flat`."""
     facing, area = _normal(old[..., :3])
     chosen = _nearest(old[..., :3].mean(axis=1), facing, place.mean(axis=1), flat)
     a, b, c = (old[chosen, i, None] for i in range(3))
