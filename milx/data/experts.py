@@ -37,14 +37,9 @@ def expert_of(env: Env, config: DataConfig) -> Options | Sampling | receding.Set
     Raises:
         ValueError: for another name than those of EXPERTS, or sampling without an iteration.
     """
-    if config.expert not in EXPERTS:
-        raise ValueError(f"data.expert: got {config.expert!r}, expected one of {', '.join(EXPERTS)}")
+    _check(config)
     if config.expert == "ilqr":
         return Options(iterations=config.plan_iterations)
-    if config.plan_iterations < 1:
-        raise ValueError(
-            f"data.plan_iterations: got {config.plan_iterations}, expected at least 1 with {config.expert}"
-        )
     if config.expert == "receding":
         search = dataclasses.replace(RECEDING.search, iterations=config.plan_iterations)
         return dataclasses.replace(RECEDING, search=search)
@@ -53,13 +48,28 @@ def expert_of(env: Env, config: DataConfig) -> Options | Sampling | receding.Set
 
 
 def description(env: Env, config: DataConfig) -> list:
-    """Lists what decides, beside versions, what an expert plans."""
+    """Lists what decides, beside versions, what an expert plans.
+
+    Raises:
+        ValueError: as `expert_of`.
+    """
+    _check(config)
     settings: dict[str, list] = {
         "ilqr": [],
         "sampling": ["sampling", repr(SETTINGS)],
         "receding": ["receding", repr(RECEDING), env.ahead],
     }
     return [config.noise, config.plan_iterations, *settings[config.expert]]
+
+
+def _check(config: DataConfig) -> None:
+    """Refuses what `expert_of` documents."""
+    if config.expert not in EXPERTS:
+        raise ValueError(f"data.expert: got {config.expert!r}, expected one of {', '.join(EXPERTS)}")
+    if config.expert != "ilqr" and config.plan_iterations < 1:
+        raise ValueError(
+            f"data.plan_iterations: got {config.plan_iterations}, expected at least 1 with {config.expert}"
+        )
 
 
 def digest(env: Env, *request: Any) -> str:

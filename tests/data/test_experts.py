@@ -38,8 +38,9 @@ def env():
     ],
 )
 def test_what_no_expert_understands_is_refused(env, changes, message):
-    with pytest.raises(ValueError, match=message):
-        experts.expert_of(env, dataclasses.replace(DataConfig(), **changes))
+    for ask in (experts.expert_of, experts.description):  # a run asks for the description first
+        with pytest.raises(ValueError, match=message):
+            ask(env, dataclasses.replace(DataConfig(), **changes))
 
 
 def test_ilqr_has_the_iterations_of_the_settings(env):
