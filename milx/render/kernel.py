@@ -25,18 +25,8 @@ _WARPS = 4
 _SLACK = 1.001  # bounding balls are blown up by this, so that rounding never hides a geom
 
 # Columns of the table of geoms.
-_AFFINE, _STRETCH, _BALL, _KIND, _RGB, _MATERIAL, _ROOT, _FAMILY, _SECOND, _FRAME = (
-    0,
-    12,
-    13,
-    17,
-    18,
-    21,
-    24,
-    25,
-    26,
-    29,
-)
+_AFFINE, _STRETCH, _BALL, _KIND, _RGB, _MATERIAL, _ROOT = 0, 12, 13, 17, 18, 21, 24
+_FAMILY, _SECOND, _FRAME = 25, 26, 29
 # Columns of the table of lights: from and to of the vectors, then the two scalars.
 _LIGHT = ((0, 3), (3, 6), (6, 9), (9, 12), (12, 16), (16, 19))
 _CUTOFF, _EXPONENT = 19, 20
