@@ -101,6 +101,11 @@ def test_the_first_line_says_what_is_done_and_how_long_it_took(train, tmp_path):
     assert "This took" not in said, "that was measured for MIL"
 
 
+def test_a_device_without_a_preset_is_told_which_there_are(train):
+    said = train("--env=grasp").stderr
+    assert "--preset: got none, expected one of paper, fast: grasp has none for this device" in said
+
+
 def test_a_method_has_no_settings_of_another(train):
     said = train("--method=lstm", "--config.method.inner_steps=7").stderr
     assert "--config.method.inner_steps: no such field with --method=lstm, expected one of" in said
