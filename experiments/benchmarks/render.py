@@ -28,9 +28,6 @@ from milx.core import platform
 from milx.envs.base import Env
 from milx.render.scene import Scene, to_uint8
 
-_OUT = flags.DEFINE_string("out", str(common.RESULTS), "Folder of the JSON file.")
-_FRAMES = flags.DEFINE_integer("frames", None, "Frames at once; 4,096 on an accelerator and 64 on a CPU by default.")
-
 
 def random_scenes(env: Env, count: int) -> Scene:
     """Draws scenes of random states after forward kinematics, with a leading axis."""
@@ -43,22 +40,28 @@ def random_scenes(env: Env, count: int) -> Scene:
     return jax.jit(jax.vmap(scene))(jax.random.split(jax.random.key(1), count))
 
 
-def measure_warp(env: Env, count: int) -> tuple[float, None]:
-    """Measures frames/s of MJX-Warp's batch renderer, which builds its bounding volumes anew for new poses."""
+def measure_warp(
+    model: mujoco.MjModel, image_shape: tuple[int, int], qpos: jax.Array, mocap_pos: jax.Array
+) -> tuple[float, None]:
+    """Measures frames/s of MJX-Warp's batch renderer, which builds its bounding volumes anew for new poses.
+
+    Args:
+        model: whose cameras are all drawn.
+        image_shape: (H, W).
+        qpos: [N, nq] of N scenes.
+        mocap_pos: [N, nmocap, 3] of the same.
+    """
     import warp  # noqa: F401  without it MJX fails later and says less
 
-    model = env.mj_model
-    mx = mjx.put_model(model, impl="warp")
-    task = env.sample_task(jax.random.key(0), "train")
+    mx, count = mjx.put_model(model, impl="warp"), len(qpos)
 
-    def pose(key: jax.Array) -> mjx.Data:
-        state = env.reset(key, task)
+    def pose(qpos: jax.Array, mocap_pos: jax.Array) -> mjx.Data:
         data = mjx.make_data(model, impl="warp", naconmax=8 * count, njmax=64)
-        return data.replace(qpos=state.qpos, mocap_pos=state.mocap_pos)
+        return data.replace(qpos=qpos, mocap_pos=mocap_pos)
 
-    data = jax.jit(jax.vmap(pose))(jax.random.split(jax.random.key(1), count))
+    data = jax.jit(jax.vmap(pose))(qpos, mocap_pos)
     data = jax.jit(jax.vmap(mjx.forward, in_axes=(None, 0)))(mx, data)
-    height, width = env.image_shape
+    height, width = image_shape
     context = mjx.create_render_context(
         mjm=model,
         nworld=count,
@@ -79,6 +82,13 @@ def measure_warp(env: Env, count: int) -> tuple[float, None]:
     if not jnp.any(image != image.ravel()[0]):
         raise RuntimeError("the image has one color only")
     return 1e3 * count / common.median_ms(compiled, mx, data), None
+
+
+def measure_warp_in(env: Env, count: int) -> tuple[float, None]:
+    """Measures MJX-Warp's frames/s in random first states of an environment."""
+    task = env.sample_task(jax.random.key(0), "train")
+    states = jax.jit(jax.vmap(lambda key: env.reset(key, task)))(jax.random.split(jax.random.key(1), count))
+    return measure_warp(env.mj_model, env.image_shape, states.qpos, states.mocap_pos)
 
 
 def measure_opengl(model: mujoco.MjModel, camera: str, image_shape: tuple[int, int]) -> float:
@@ -103,11 +113,10 @@ def measure_opengl_elsewhere(env: Env) -> tuple[float, None]:
         return pool.submit(measure_opengl, env.mj_model, env.camera, env.image_shape).result(), None
 
 
-def measure_milx(env: Env, count: int, draw: Callable[[Scene], jax.Array]) -> tuple[float, float]:
-    """Measures frames/s and GiB of a function from a scene to pixels."""
-    scenes = random_scenes(env, count)
+def measure_milx(scenes: Scene, draw: Callable[[Scene], jax.Array]) -> tuple[float, float]:
+    """Measures frames/s and GiB of a function from a scene to pixels, in scenes with a leading axis."""
     compiled = jax.jit(jax.vmap(draw)).lower(scenes).compile(platform.pixel_options())
-    return 1e3 * count / common.median_ms(compiled, scenes), common.gib(compiled)
+    return 1e3 * len(scenes.cam_xpos) / common.median_ms(compiled, scenes), common.gib(compiled)
 
 
 def main(_: list[str]) -> None:
@@ -119,14 +128,18 @@ def main(_: list[str]) -> None:
     for env in (push_sized.PushSized(), envs.make("reach")):
         height, width = env.image_shape
         name = f"{env.name}, {env.mj_model.ngeom} geoms, {width}x{height}"
-        draw = env.renderer.pixels
-        report.measure(f"{name}: milx", "frames/s", lambda e=env, d=draw: measure_milx(e, count, d), note)
+        scenes, draw = random_scenes(env, count), env.renderer.pixels
+        report.measure(f"{name}: milx", "frames/s", lambda s=scenes, d=draw: measure_milx(s, d), note)
         if common.accelerated():
             draw = lambda scene, r=env.renderer: to_uint8(r.render(scene).color)  # noqa: E731
-            report.measure(f"{name}: milx, XLA", "frames/s", lambda e=env, d=draw: measure_milx(e, count, d), note)
-        report.attempt(f"{name}: MJX-Warp", "frames/s", lambda e=env: measure_warp(e, count), note)
+            report.measure(f"{name}: milx, XLA", "frames/s", lambda s=scenes, d=draw: measure_milx(s, d), note)
+        report.attempt(f"{name}: MJX-Warp", "frames/s", lambda e=env: measure_warp_in(e, count), note)
         report.attempt(f"{name}: mujoco.Renderer", "frames/s", lambda e=env: measure_opengl_elsewhere(e), "one by one")
 
 
 if __name__ == "__main__":
+    _OUT = flags.DEFINE_string("out", str(common.RESULTS), "Folder of the JSON file.")
+    _FRAMES = flags.DEFINE_integer(
+        "frames", None, "Frames at once; 4,096 on an accelerator and 64 on a CPU by default."
+    )
     app.run(main)

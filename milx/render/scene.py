@@ -198,9 +198,9 @@ class Renderer:
     def pixels(self, scene: Scene) -> jax.Array:
         """Draws the image alone, [H, W, 3] uint8, without gradients.
 
-        On a GPU it is one kernel if no shadows fall and no mesh is shown.
+        On a GPU it is one kernel if no shadows fall and no mesh shows a texture.
         """
-        if jax.default_backend() != "gpu" or self._shadows or self._meshes is not None:
+        if jax.default_backend() != "gpu" or self._shadows or self._images is not None:
             return to_uint8(self.render(scene).color)
         return self.paint(scene)
 
