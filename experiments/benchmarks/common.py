@@ -35,7 +35,9 @@ def median_ms(
 
 def gib(compiled: jax.stages.Compiled) -> float:
     """Returns the memory a compiled program needs beside arguments and results; PyTorch's numbers include those."""
-    return compiled.memory_analysis().temp_size_in_bytes / 2**30
+    memory = compiled.memory_analysis()
+    assert memory is not None, "CPUs and GPUs tell"
+    return memory.temp_size_in_bytes / 2**30
 
 
 @dataclasses.dataclass

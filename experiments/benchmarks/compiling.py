@@ -39,12 +39,12 @@ def main(_: list[str]) -> None:
         milx.configure()
         from common import RESULTS, Report  # uses JAX
 
-        seconds: dict[str, collections.Counter[str]] = collections.defaultdict(collections.Counter)
+        seconds: dict[str, dict[str, float]] = collections.defaultdict(lambda: dict.fromkeys(PARTS.values(), 0.0))
 
-        def note(event: str, duration: float, **about: str | int) -> None:
+        def note(event: str, duration_secs: float, **about: str | int) -> None:
             if event in PARTS:
                 name = str(about.get("fun_name")).removeprefix("jit(").removesuffix(")")
-                seconds[name][PARTS[event]] += duration
+                seconds[name][PARTS[event]] += duration_secs
 
         jax.monitoring.register_event_duration_secs_listener(note)
         config = make_config(_ENV.value, preset=_PRESET.value)
@@ -53,9 +53,9 @@ def main(_: list[str]) -> None:
         config.evaluation.validation_tasks = config.evaluation.batch = 4
         make_run(config, pathlib.Path(folder) / "run", Console(quiet=True)).train()
         report = Report("compiling", pathlib.Path(_OUT.value or RESULTS))
-        for name in sorted(seconds, key=lambda name: -seconds[name].total())[:_LONGEST]:
+        for name in sorted(seconds, key=lambda name: -sum(seconds[name].values()))[:_LONGEST]:
             parts = ", ".join(f"{part} {seconds[name][part]:.2f} s" for part in PARTS.values())
-            report.add(f"{_ENV.value} {_PRESET.value}, {name}", seconds[name].total(), "s", note=parts)
+            report.add(f"{_ENV.value} {_PRESET.value}, {name}", sum(seconds[name].values()), "s", note=parts)
 
 
 if __name__ == "__main__":

@@ -68,6 +68,7 @@ def write_lerobot(root: pathlib.Path, codec: str) -> None:
     video.parent.mkdir(parents=True)
     with av.open(str(video), "w") as container:
         stream = container.add_stream(codec, rate=FPS, options={"g": "2", "crf": "30"})
+        assert isinstance(stream, av.VideoStream)
         stream.width = stream.height = SIZE
         stream.pix_fmt = "yuv420p"
         background = rng.integers(0, 256, (16, 16, 3), np.uint8).repeat(8, axis=0).repeat(8, axis=1)

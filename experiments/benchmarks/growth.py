@@ -6,6 +6,7 @@ The paper's reach network, rendering included; one size changes at a time from 5
 pixels and 1 inner step.
 """
 
+import functools
 import pathlib
 
 import common
@@ -15,6 +16,8 @@ from absl import app, flags
 import milx
 from milx import envs
 from milx.config.assemble import make_config
+from milx.methods.mil import MILConfig
+from milx.networks.policy_network import PolicyConfig
 
 _OUT = flags.DEFINE_string("out", str(common.RESULTS), "Folder of the JSON file.")
 _TINY = flags.DEFINE_bool("tiny", False, "One size of each, for a try.")
@@ -33,6 +36,7 @@ def main(_: list[str]) -> None:
     changes = [(name, size) for name, sizes in _SIZES.items() for size in sizes[: 1 if _TINY.value else None]]
     for name, size in [("meta-batch", 5), *changes]:
         config = make_config("reach", preset="paper")
+        assert isinstance(config.method, MILConfig) and isinstance(config.network, PolicyConfig)
         config.train.meta_batch, config.method.imitation_steps = 5, 0
         config.network.mixed_precision = common.accelerated()
         frames = size if name == "time steps" else config.train.support_frames
@@ -42,7 +46,9 @@ def main(_: list[str]) -> None:
         rows = size if name == "image rows" else config.env.image_shape[0]
         config.env.image_shape = (rows, rows * 5 // 4)
         report.measure(
-            f"{name} {size}", "ms", lambda c=config: workload.measure_step(c, envs.make("reach", c.env.image_shape))
+            f"{name} {size}",
+            "ms",
+            functools.partial(workload.measure_step, config, envs.make("reach", config.env.image_shape)),
         )
 
 

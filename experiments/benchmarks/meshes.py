@@ -8,6 +8,7 @@ written to meshes.json, or meshes-cpu.json without an accelerator.
 
 import render  # first: it sets how much memory JAX takes  # isort: skip
 
+import functools
 import pathlib
 
 import common
@@ -19,7 +20,7 @@ from absl import app, flags
 
 import milx
 from milx.render import Renderer
-from milx.render.scene import Scene, to_uint8
+from milx.render.scene import Scene
 
 SIZE = 128
 """Height and width of an image, in pixels."""
@@ -55,7 +56,8 @@ def positions(model: mujoco.MjModel, count: int) -> np.ndarray:
     qpos = np.tile(model.qpos0, (count, 1))
     for joint in range(model.njnt):
         if model.jnt_type[joint] >= int(mujoco.mjtJoint.mjJNT_SLIDE) and model.jnt_limited[joint]:
-            qpos[:, model.jnt_qposadr[joint]] = rng.uniform(*model.jnt_range[joint], count)
+            low, high = model.jnt_range[joint]
+            qpos[:, model.jnt_qposadr[joint]] = rng.uniform(low, high, count)
     return qpos
 
 
@@ -107,20 +109,20 @@ def main(_: list[str]) -> None:
         first, some = jax.tree.map(lambda x: x[:POSES], scenes), jax.tree.map(lambda x: x[:count], scenes)
         share = agreement(model, renderer, qpos[:POSES], first)
         report.add(f"{name}: agrees with mj_ray", 100 * share, "% of the pixels", note=f"in {POSES} positions")
-        draw = lambda scene, r=renderer: to_uint8(r.render(scene).color)  # noqa: E731
-        report.measure(f"{name}: milx, XLA", "frames/s", lambda s=some, d=draw: render.measure_milx(s, d), note)
+        draw = functools.partial(render.draw_by_xla, renderer)
+        report.measure(f"{name}: milx, XLA", "frames/s", functools.partial(render.measure_milx, some, draw), note)
         if common.accelerated():
             painted, drawn = (np.asarray(jax.jit(jax.vmap(f))(first), int) for f in (renderer.paint, draw))
             share = float(np.mean(np.abs(painted - drawn).max(axis=-1) <= 1))
             report.add(f"{name}: the kernel draws what XLA draws", 100 * share, "% of the pixels", note="to 1 of 255")
             report.measure(
-                f"{name}: milx, kernel", "frames/s", lambda s=some, r=renderer: render.measure_milx(s, r.paint), note
+                f"{name}: milx, kernel", "frames/s", functools.partial(render.measure_milx, some, renderer.paint), note
             )
         poses = jnp.asarray(qpos[:count], float), jnp.zeros((count, model.nmocap, 3))
         report.attempt(
             f"{name}: MJX-Warp",
             "frames/s",
-            lambda m=model, p=poses: render.measure_warp(m, (SIZE, SIZE), *p),
+            functools.partial(render.measure_warp, model, (SIZE, SIZE), *poses),
             note,
         )
 

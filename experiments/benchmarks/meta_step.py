@@ -30,6 +30,7 @@ from milx.config.schema import Config
 from milx.core import platform
 from milx.envs.base import Env
 from milx.networks import layers
+from milx.networks.policy_network import PolicyConfig
 from milx.training.update import Loss, meta_gradient
 from milx.types import Params, TaskBatch
 
@@ -76,6 +77,7 @@ def floor_ms(config: Config, env: Env, tasks: int, frames: int) -> tuple[float, 
     first layer, which needs no gradient of the image); the support demonstration takes one of each, and twice that
     again for the Hessian-vector product; the query one of each. Every pass reads its inputs and writes its outputs.
     """
+    assert isinstance(config.network, PolicyConfig)
     n = 8192
     a = jax.random.normal(jax.random.key(0), (n, n), jnp.bfloat16)
     product = jax.jit(lambda a: a @ a)
@@ -139,6 +141,7 @@ def measure_domain(name: str) -> None:
     repeats = 20 if common.accelerated() else 3
 
     def variant(mixed: bool, rematerialise: bool = False) -> Config:
+        assert isinstance(config.network, PolicyConfig)
         network = dataclasses.replace(config.network, mixed_precision=mixed, rematerialise=rematerialise)
         return dataclasses.replace(config, network=network)
 
@@ -149,11 +152,11 @@ def measure_domain(name: str) -> None:
     accelerated = common.accelerated()
     for mixed in (True, False) if accelerated else (False,):
         kind = "bfloat16" if mixed else "float32"
-        report.measure(f"milx, {kind}", "ms", lambda mixed=mixed: gradient(mixed), f"{sizes}, called one by one")
+        report.measure(f"milx, {kind}", "ms", functools.partial(gradient, mixed), f"{sizes}, called one by one")
         report.measure(
             f"milx, {kind}, whole step with rendering",
             "ms",
-            lambda m=mixed: workload.measure_step(variant(m), env),
+            functools.partial(workload.measure_step, variant(mixed), env),
             "in a scan",
         )
     report.measure("milx, rematerialised", "ms", lambda: gradient(accelerated, True))
@@ -161,12 +164,14 @@ def measure_domain(name: str) -> None:
     for mixed in (True, False) if accelerated else (False,):
         kind = "bfloat16" if mixed else "float32"
         report.attempt(
-            f"JAX, vmap over lax.conv, {kind}", "ms", lambda mixed=mixed: gradient(mixed, by=vmapped_gradient)
+            f"JAX, vmap over lax.conv, {kind}", "ms", functools.partial(gradient, mixed, by=vmapped_gradient)
         )
     layers.conv2d = ours
     for mode, bf16 in (("loop", False), ("vmap", False), ("vmap", True), ("compile", False), ("compile", True)):
         kind = "bfloat16" if bf16 else "float32"
-        report.attempt(f"PyTorch, {mode}, {kind}", "ms", lambda m=mode, b=bf16: measure_torch(config, env, batch, m, b))
+        report.attempt(
+            f"PyTorch, {mode}, {kind}", "ms", functools.partial(measure_torch, config, env, batch, mode, bf16)
+        )
     if accelerated:
         least, note = floor_ms(config, env, tasks, frames)
         report.add("roofline", least, "ms", note=note)

@@ -3,6 +3,7 @@
 python experiments/benchmarks/physics.py
 """
 
+import functools
 import os
 
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # Warp needs memory in the same process
@@ -106,7 +107,7 @@ def main(_: list[str]) -> None:
     report.attempt("mujoco.rollout", unit, lambda: measure_rollout(env, worlds, threads), f"{threads} threads")
     for how in ("jacfwd", "mapped jvp"):
         report.measure(
-            f"Jacobians, {how}", "1/s", lambda how=how: measure_jacobians(env, points, how), f"{points} at once"
+            f"Jacobians, {how}", "1/s", functools.partial(measure_jacobians, env, points, how), f"{points} at once"
         )
 
 

@@ -28,7 +28,7 @@ import milx
 from milx import envs
 from milx.envs.base import State
 from milx.trajopt import sampling
-from milx.trajopt.episode import problem_of, steered
+from milx.trajopt.episode import approximated, problem_of, steered
 from milx.trajopt.ilqr import Problem
 from milx.trajopt.sampling import Options
 
@@ -81,7 +81,7 @@ class Scene:
         """Prepares milx's search in velocities of the hand."""
         problem = self._velocities
         if approximate:
-            problem = problem._replace(dynamics=problem.approximation)
+            problem = approximated(problem)
         return self._search(problem, self._cost_of_velocities, self.env.steering.deviation)
 
     def _search(self, problem: Problem, cost: Callable[[jax.Array], jax.Array], deviation: jax.Array) -> Searcher:

@@ -9,6 +9,7 @@ import os
 
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # Warp needs memory in the same process
 
+import functools
 import multiprocessing
 import pathlib
 from collections.abc import Callable
@@ -26,7 +27,7 @@ import milx
 from milx import envs
 from milx.core import platform
 from milx.envs.base import Env
-from milx.render.scene import Scene, to_uint8
+from milx.render.scene import Renderer, Scene, to_uint8
 
 
 def random_scenes(env: Env, count: int) -> Scene:
@@ -113,6 +114,11 @@ def measure_opengl_elsewhere(env: Env) -> tuple[float, None]:
         return pool.submit(measure_opengl, env.mj_model, env.camera, env.image_shape).result(), None
 
 
+def draw_by_xla(renderer: Renderer, scene: Scene) -> jax.Array:
+    """Draws what `pixels` does, by the reference on every device."""
+    return to_uint8(renderer.render(scene).color)
+
+
 def measure_milx(scenes: Scene, draw: Callable[[Scene], jax.Array]) -> tuple[float, float]:
     """Measures frames/s and GiB of a function from a scene to pixels, in scenes with a leading axis."""
     compiled = jax.jit(jax.vmap(draw)).lower(scenes).compile(platform.pixel_options())
@@ -129,12 +135,14 @@ def main(_: list[str]) -> None:
         height, width = env.image_shape
         name = f"{env.name}, {env.mj_model.ngeom} geoms, {width}x{height}"
         scenes, draw = random_scenes(env, count), env.renderer.pixels
-        report.measure(f"{name}: milx", "frames/s", lambda s=scenes, d=draw: measure_milx(s, d), note)
+        report.measure(f"{name}: milx", "frames/s", functools.partial(measure_milx, scenes, draw), note)
         if common.accelerated():
-            draw = lambda scene, r=env.renderer: to_uint8(r.render(scene).color)  # noqa: E731
-            report.measure(f"{name}: milx, XLA", "frames/s", lambda s=scenes, d=draw: measure_milx(s, d), note)
-        report.attempt(f"{name}: MJX-Warp", "frames/s", lambda e=env: measure_warp_in(e, count), note)
-        report.attempt(f"{name}: mujoco.Renderer", "frames/s", lambda e=env: measure_opengl_elsewhere(e), "one by one")
+            draw = functools.partial(draw_by_xla, env.renderer)
+            report.measure(f"{name}: milx, XLA", "frames/s", functools.partial(measure_milx, scenes, draw), note)
+        report.attempt(f"{name}: MJX-Warp", "frames/s", functools.partial(measure_warp_in, env, count), note)
+        report.attempt(
+            f"{name}: mujoco.Renderer", "frames/s", functools.partial(measure_opengl_elsewhere, env), "one by one"
+        )
 
 
 if __name__ == "__main__":

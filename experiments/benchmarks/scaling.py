@@ -16,6 +16,7 @@ from jax.sharding import Mesh
 
 import milx
 from milx.core import parallel
+from milx.networks.policy_network import PolicyConfig
 
 _OUT = flags.DEFINE_string("out", str(common.RESULTS), "Folder of the JSON file.")
 _TASKS = flags.DEFINE_integer("tasks", 15, "Tasks on each device.")
@@ -28,6 +29,7 @@ def measure(devices: int) -> tuple[float, float]:
     parallel.mesh = lambda: mesh  # type: ignore[assignment]
     frames = _FRAMES.value
     config = push_sized.config(meta_batch=devices * _TASKS.value, support_frames=frames, query_frames=frames)
+    assert isinstance(config.network, PolicyConfig)
     config.network.mixed_precision = common.accelerated()
     return workload.measure_step(config, push_sized.PushSized())
 

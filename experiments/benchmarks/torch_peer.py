@@ -9,6 +9,8 @@ import torch
 from torch.nn import functional
 
 from milx.config.schema import Config
+from milx.methods.mil import MILConfig
+from milx.networks.policy_network import PolicyConfig
 
 
 def same(x: torch.Tensor, kernel: int, stride: int) -> torch.Tensor:
@@ -29,7 +31,9 @@ def norm(x: torch.Tensor) -> torch.Tensor:
 
 def make_params(config: Config, image: tuple[int, int], state: int, action: int) -> dict[str, torch.Tensor]:
     """Samples parameters."""
-    net, params, channels, (height, width) = config.network, {}, 3, image
+    net, channels, (height, width) = config.network, 3, image
+    assert isinstance(net, PolicyConfig)
+    params: dict[str, torch.Tensor] = {}
     for i, (filters, stride) in enumerate(zip(net.filters, net.strides, strict=True)):
         fan_in = channels * net.kernel**2
         params[f"conv{i}"] = torch.randn(filters, channels, net.kernel, net.kernel) / fan_in**0.5
@@ -52,6 +56,7 @@ def make_step(config: Config, mode: str, bf16: bool) -> Callable[..., dict[str, 
         bf16: convolve in bfloat16.
     """
     net, mil = config.network, config.method
+    assert isinstance(net, PolicyConfig) and isinstance(mil, MILConfig)
     depth = len(net.fc_layers)
     dtype = torch.bfloat16 if bf16 else torch.float32
 

@@ -102,7 +102,7 @@ def markdown(found: dict[str, dict[str, Any]]) -> str:
     families = sorted({family for run in found.values() for family in run["world"]["controls"]["own"]["families"]})
     header = ["", "after", "success (95%)", "at the end", "episodes", *(name.removesuffix("-v3") for name in families)]
     lines = [f"| {' | '.join(header)} |", "|---" * len(header) + "|"]
-    without = []
+    without: list[str] = []
     for name, run in found.items():
         label, seed = ROWS[name.rpartition("-")[0]][0], name.rpartition("-")[2]
         for control, rates in run["world"]["controls"].items():

@@ -89,7 +89,7 @@ class MetaWorld(gymnasium.Env):
         self._seen, _ = self._env.reset(seed=seed)
         drift = self.np_random.uniform(-1, 1, 4)
         for _ in range(_WANDER):
-            self._seen = self._env.step(np.float32([*drift[:3], -1.0]))[0]
+            self._seen = self._env.step(np.array([*drift[:3], -1.0], np.float32))[0]
         self._steps = 0
         return self._observation(), {}
 

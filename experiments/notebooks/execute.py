@@ -30,6 +30,7 @@ def executed(name: str, folder: pathlib.Path) -> nbformat.NotebookNode:
     notebook = nbformat.read(FOLDER / f"{name}.ipynb", as_version=4)
     client = NotebookClient(notebook, timeout=3600, record_timing=False, resources={"metadata": {"path": str(folder)}})
     client.create_kernel_manager()
+    assert client.km is not None and client.km.kernel_spec is not None
     client.km.kernel_spec.argv[0] = sys.executable
     return client.execute()
 

@@ -46,7 +46,7 @@ def compare(name: str, scenes: int) -> list[dict[str, Any]]:
             config = DataConfig(noise=noise, plan_iterations=EXPERTS[name], plan_batch=256)
             demos = collect(env, key, split, scenes, 1, config)
             count = int(demos.success.sum())
-            row = {
+            row: dict[str, Any] = {
                 "split": split,
                 "noise": noise,
                 "success": count / scenes,

@@ -82,7 +82,7 @@ def markdown(rows: dict[str, Row], found: dict[str, dict[str, Any]]) -> str:
 def draw(rows: dict[str, Row], found: dict[str, dict[str, Any]], path: str) -> None:
     """Draws validation success, and by how much another task's demonstration is worse, against the meta-updates."""
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4), layout="constrained")
-    colors = [*plt.get_cmap("tab10").colors, *plt.get_cmap("Set2").colors]
+    colors = [plt.get_cmap(name)(i) for name, count in (("tab10", 10), ("Set2", 8)) for i in range(count)]
     for number, (name, row) in enumerate(rows.items()):
         with_curve = [run for run in _runs(name, row.shots[0], found) if "curve" in run]
         for i, run in enumerate(with_curve):

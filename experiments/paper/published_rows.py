@@ -80,7 +80,7 @@ _MUON = {"optimizer.name": "muon"}
 _BEGINNING = _MUON | {"train.frame_exponent": 2.0}
 _SMALL_PIXELS = {"env.image_shape": (32, 40), "train.steps": 12_000}
 _TEN = {"train.meta_batch": 16, "train.support_frames": 10, "train.query_frames": 10}
-_SMALL = {
+_SMALL: dict[str, tuple[str, dict[str, Any]]] = {
     "all": ("`paper`'s batches", {}),
     "all-muon": ("`paper`'s batches, Muon", _MUON),
     "ten": ("16 tasks of 10 + 10 time steps", _TEN),

@@ -77,7 +77,8 @@ def make(table: Table) -> None:
     """
     milx.configure()
     rows = chosen(table.rows)
-    folder, runners = options.folder(table.folder), {}
+    folder = options.folder(table.folder)
+    runners: dict[int, cells.Cells] = {}
     seeds = range(options.SEEDS.value)
     for seed in seeds:
         for name, row in {} if options.SHOW.value else rows.items():

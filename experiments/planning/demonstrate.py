@@ -71,7 +71,7 @@ def main(_: list[str]) -> None:
     for name in _ENVS.value:
         config = make_config(name, preset="fast").data
         expert = _EXPERT.value
-        changes = {"expert": expert, "plan_iterations": ITERATIONS[expert], "plan_batch": _BATCH.value}
+        changes: dict[str, Any] = {"expert": expert, "plan_iterations": ITERATIONS[expert], "plan_batch": _BATCH.value}
         config = dataclasses.replace(config, **changes)
         env, settings = envs.make(name, (16, 16)), {"first_seed": FIRST_SEED}
         settings |= (

@@ -88,8 +88,7 @@ class Measurement:
     @functools.partial(jax.jit, static_argnums=0)
     def improve(self, search: Search, keys: jax.Array) -> Search:
         """Does one iteration."""
-        one = lambda *of_scene: self.planner.improve(*of_scene, 1)  # noqa: E731
-        return jax.vmap(one)(self.task, self.start, search, keys)
+        return jax.vmap(functools.partial(self.planner.improve, iterations=1))(self.task, self.start, search, keys)
 
     def plan(self, search: Search, iterations: int, rollouts: int) -> tuple[Search, list[dict[str, Any]]]:
         """Improves plans.
@@ -112,7 +111,11 @@ class Measurement:
         return search, curve
 
     def _point(self, search: Search, rollouts: int, seconds: float) -> dict[str, Any]:
-        found = {"rollouts": rollouts, "success": float(self.execute(search).mean()), "seconds": seconds}
+        found: dict[str, Any] = {
+            "rollouts": rollouts,
+            "success": float(self.execute(search).mean()),
+            "seconds": seconds,
+        }
         cost = float(jnp.median(search.cost))
         found["cheapest_cost"] = cost if math.isfinite(cost) else None
         print(found, flush=True)

@@ -16,6 +16,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from typing import Any
 
 import jax
 import numpy as np
@@ -137,7 +138,8 @@ def main(_: list[str]) -> None:
         began = time.monotonic()
         expected = finish(folder / "data", folder / "undisturbed")
         longest = time.monotonic() - began
-        kills, rounds = [], 0
+        kills: list[dict[str, Any]] = []
+        rounds = 0
         while len(kills) < _KILLS.value:
             rounds += 1
             workdir = folder / f"round-{rounds}"
@@ -148,7 +150,7 @@ def main(_: list[str]) -> None:
                     print(len(kills), found, flush=True)
             if finish(folder / "data", workdir) != expected:
                 raise RuntimeError(f"round {rounds} ends with other parameters")
-        terms = []
+        terms: list[dict[str, Any]] = []
         while len(terms) < _TERMS.value:
             workdir = folder / f"term-{len(terms)}"
             shutil.rmtree(workdir, ignore_errors=True)  # of a run that had ended before the signal

@@ -98,7 +98,7 @@ def main(_: list[str]) -> None:
             for other, (environment, kill_at) in others().items():
                 found = train(command, first.with_name(f"{first.name}-{other}"), alone | environment, kill_at)
                 apart = np.abs(found.losses - expected.losses) / np.abs(expected.losses)
-                row = {"env": env, "precision": precision, "compared": other}
+                row: dict[str, Any] = {"env": env, "precision": precision, "compared": other}
                 row["same_parameters"] = found.digest == expected.digest
                 row["losses_apart"] = {str(EVERY * (i + 1)): float(value) for i, value in enumerate(apart)}
                 rows.append(row)

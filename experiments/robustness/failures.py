@@ -269,7 +269,9 @@ def main(_: list[str]) -> None:
         with concurrent.futures.ThreadPoolExecutor(FLAGS.processes) as pool:
             pairs = zip(numbers, itertools.cycle(kinds), strict=False)
             lives = []
-            for life in pool.map(lambda pair: fail_once(folder, *pair, params, library, FLAGS.planning), pairs):
+            for life in pool.map(
+                lambda pair: fail_once(folder, pair[0], pair[1], params, library, FLAGS.planning), pairs
+            ):
                 lives.append(life)
                 if life["wrong"]:
                     print(
