@@ -25,7 +25,7 @@ from milx.trajopt import replanning, sampling
 from milx.trajopt.episode import approximated, steered
 from milx.trajopt.sampling import Options
 
-SEARCH = Options("cross_entropy", samples=64, order=3, elites=4, deviation_min=0.03)
+SEARCH = Options("cross_entropy", samples=96, order=3, elites=4, deviation_min=0.03)
 
 
 @dataclasses.dataclass(frozen=True)
