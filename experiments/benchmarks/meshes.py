@@ -28,6 +28,8 @@ FOVY = 45.0
 """Vertical field of view (degrees)."""
 POSES = 8
 """In how many of the positions pixels are compared."""
+FEW = 4
+"""Frames at once by XLA, which is slow."""
 DEPTH = 1e-3
 """By what part of the model's extent depths of pixels that agree may differ."""
 
@@ -106,11 +108,13 @@ def main(_: list[str]) -> None:
         name = f"{name}, {len(shown)} meshes, {model.mesh_facenum[shown].sum():,} triangles, {SIZE}x{SIZE}"
         qpos = positions(model, max(count, POSES))
         scenes = scenes_at(model, renderer, qpos)
-        first, some = jax.tree.map(lambda x: x[:POSES], scenes), jax.tree.map(lambda x: x[:count], scenes)
+        few, first, some = (jax.tree.map(lambda x, n=n: x[:n], scenes) for n in (FEW, POSES, count))
         share = agreement(model, renderer, qpos[:POSES], first)
         report.add(f"{name}: agrees with mj_ray", 100 * share, "% of the pixels", note=f"in {POSES} positions")
         draw = functools.partial(render.draw_by_xla, renderer)
-        report.measure(f"{name}: milx, XLA", "frames/s", functools.partial(render.measure_milx, some, draw), note)
+        report.measure(
+            f"{name}: milx, XLA", "frames/s", functools.partial(render.measure_milx, few, draw), f"{FEW} at once"
+        )
         if common.accelerated():
             painted, drawn = (np.asarray(jax.jit(jax.vmap(f))(first), int) for f in (renderer.paint, draw))
             share = float(np.mean(np.abs(painted - drawn).max(axis=-1) <= 1))
