@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import milx
-from milx import methods
+from milx import envs, methods
 from milx.config import assemble
 from milx.config.assemble import make_config
 from milx.deploy import standalone
@@ -37,15 +37,14 @@ print(json.dumps(sorted({name.split(".")[0] for name in sys.modules})))
 
 def make_policy(method="mil", **settings):
     """Makes an untrained policy for small images, whose whitening is not the identity."""
-    env = milx.make("reach", (16, 20))
     config = make_config("reach", method, "cpu")
-    config.env.image_shape = (16, 20)
+    config.env.image_shape, config.env.goal_step = (16, 20), 20
     config.network.filters, config.network.strides, config.network.fc_layers = (4, 4), (2, 2), (16,)
     if settings.get("given") == "video":
         config.network.learned_loss, config.network.hindsight_head = "linear", True
     for name, value in settings.items():
         assemble.assign(config, f"method.{name}", value)
-    spec = env.spec
+    spec = envs.of_config(config).spec
     whitening = Whitening(jnp.full(8, 0.2), jnp.full(8, 2.0), jnp.full(2, 0.1), jnp.full(2, 0.3))
     made = methods.make(config, spec)
     return Policy(made, spec, jax.jit(made.init)(jax.random.key(0), whitening), config)
