@@ -5,7 +5,8 @@ succeeded, and improves it. The plan is then executed: the robot returns to its 
 it off, and every few steps what is left is planned again (`replanning.execute`). Candidates are rolled out by
 `Env.approximate_step`, and what is executed happens by `Env.step`. The nearest scenes are those whose first states have
 the most similar running residuals. The first plans are searched from nothing (`find_plans`); scenes in which that fails
-begin again with those of others (`share_plans`).
+begin again with those of others (`share_plans`). All scenes that are demonstrated draw the same candidates, so that
+similar scenes are demonstrated alike, and a policy can learn what they have in common.
 
 Reference:
     Laskey et al., "DART: noise injection for robust imitation learning", CoRL 2017 (the recorded action is the one
@@ -136,13 +137,13 @@ class Planner:
     def execute(
         self, task: Task, start: State, search: Search, key: jax.Array, noise: jax.Array | float, tracking: bool = True
     ) -> tuple[State, jax.Array]:
-        """Executes a plan.
+        """Executes a plan; what is left of it is planned again with the same candidates in all scenes.
 
         Args:
             task: what is to be done.
             start: the scene.
             search: the plan.
-            key: draws noise and candidates.
+            key: draws noise.
             noise: standard deviation of the noise on the actions, in their units.
             tracking: whether the robot returns to its path.
 
@@ -158,14 +159,14 @@ class Planner:
             if tracking:
                 controls = controls + steering.correction(state, start.with_vector(expected))
             action = jnp.clip(steering.action(state, controls), *env.action_range)
-            noisy = action + noise * jax.random.normal(key, action.shape)
+            noisy = action + noise * jax.random.normal(jax.random.fold_in(key, own), action.shape)
             return env.step(task, state, noisy).vector, action
 
         every = max(steps for steps in range(1, settings.every + 1) if env.horizon % steps == 0)
         search = search._replace(deviation=jnp.broadcast_to(self._near, search.deviation.shape))
-        problem = self.problem(task, start)
+        problem, own = self.problem(task, start), jax.random.bits(key)
         states, actions = replanning.execute(
-            problem, start.vector, search, env.horizon, every, key, settings.again, plant
+            problem, start.vector, search, env.horizon, every, jax.random.key(0), settings.again, plant
         )
         return jax.vmap(start.with_vector)(states), actions
 
@@ -193,16 +194,16 @@ def demonstrate(
         noise: standard deviation of the noise on the actions, in their units.
         task: [N], what is to be done.
         start: [N], the scenes.
-        key: [N], draw candidates and noise.
+        key: [N], draw noise.
 
     Returns:
         The states, with leading axes [N, T + 1], and the actions without noise [N, T, A].
     """
 
     def one(plans: Plans, noise: jax.Array, task: Task, start: State, key: jax.Array) -> tuple[State, jax.Array]:
-        planner, (search_key, key) = Planner(env, settings), jax.random.split(key)
+        planner = Planner(env, settings)
         search = planner.begin_from(task, start, plans)
-        search = planner.improve(task, start, search, search_key, settings.search.iterations)
+        search = planner.improve(task, start, search, jax.random.key(0), settings.search.iterations)
         return planner.execute(task, start, search, key, noise)
 
     batched = jax.vmap(one, in_axes=(None, None, 0, 0, 0))

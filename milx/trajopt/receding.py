@@ -5,7 +5,8 @@ what is left of the last plan, and the first of its controls is executed (recedi
 The first plan begins with controls of zero, and where noise or contacts drive the robot off, the next one begins there.
 The controls are those of `Env.steering`, candidates are rolled out by `Env.approximate_step`, and what is executed
 happens by `Env.step`. Every plan pays the episode's terminal cost for its last state, wherever in the episode that is,
-and at the end of an episode plans look beyond it, as if the running costs went on.
+and at the end of an episode plans look beyond it, as if the running costs went on. All scenes draw the same candidates,
+so that similar scenes are demonstrated alike, and a policy can learn what they have in common.
 
 References:
     Howell et al., "Predictive sampling: real-time behaviour synthesis with MuJoCo", arXiv:2212.00541.
@@ -60,7 +61,7 @@ def demonstrate(
         noise: standard deviation of the noise on the actions, in their units.
         task: [N], what is to be done.
         start: [N], the scenes.
-        key: [N], draw candidates and noise.
+        key: [N], draw noise.
 
     Returns:
         The states, with leading axes [N, T + 1], and the actions without noise [N, T, A].
@@ -77,11 +78,13 @@ def demonstrate(
         def plant(x: jax.Array, controls: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
             state = start.with_vector(x)
             action = jnp.clip(steering.action(state, controls), *env.action_range)
-            return env.step(task, state, action + noise * jax.random.normal(key, action.shape)).vector, action
+            noisy = action + noise * jax.random.normal(jax.random.fold_in(key, own), action.shape)
+            return env.step(task, state, noisy).vector, action
 
+        own, shared = jax.random.bits(key), jax.random.key(0)
         problem = approximated(steered(env, task, start))
         states, actions = replanning.control(
-            problem, start.vector, first, ahead, env.horizon, 1, key, settings.search, plant
+            problem, start.vector, first, ahead, env.horizon, 1, shared, settings.search, plant
         )
         return jax.vmap(start.with_vector)(states), actions
 

@@ -181,6 +181,18 @@ def test_a_plan_that_is_kept_is_tracked_in_the_world(cart, scenes):
             np.testing.assert_allclose(states.qpos[t + 1], state.qpos, atol=1e-5)
 
 
+def test_only_noise_tells_two_demonstrations_of_a_scene_apart(cart, scenes, plans):
+    task, start = jax.tree.map(lambda x: jnp.repeat(x[:1], len(x), axis=0), scenes[:2])
+    _, alike = planner.demonstrate(cart, SETTINGS, plans, 0.0, task, start, scenes[2])
+    np.testing.assert_allclose(alike, jnp.repeat(alike[:1], len(alike), axis=0), atol=1e-6)
+    states, actions = planner.demonstrate(cart, SETTINGS, plans, NOISE, task, start, scenes[2])
+    driven = np.diff(states.qvel[..., 0], axis=1) / 0.25
+    drawn = np.where(np.abs(driven) < 0.99, driven - actions[..., 0], np.nan)
+    apart, count = drawn - np.nanmean(drawn, axis=0), np.isfinite(drawn).sum()
+    assert count > 300
+    np.testing.assert_allclose(np.sqrt(np.nanmean(apart**2)), NOISE, rtol=3 / np.sqrt(2 * count))
+
+
 def test_scenes_do_not_depend_on_those_beside_them(cart, scenes, plans):
     task, start, keys = scenes
     few = lambda tree: jax.tree.map(lambda x: x[:8], tree)  # noqa: E731

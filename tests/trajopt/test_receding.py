@@ -49,7 +49,7 @@ def test_what_is_executed_is_what_was_recorded_and_noise(cart, scenes):
 
 
 def test_plans_are_made_in_the_approximation_and_executed_in_the_world(cart, scenes):
-    """A loop searches in the lighter cart's dynamics, with the same keys, and drives the heavier one."""
+    """A loop searches in the lighter cart's dynamics, with the candidates of all scenes, and drives the heavier one."""
     task, start = scenes[0][0], jax.tree.map(lambda x: x[0], scenes[1])
     alone = jax.tree.map(lambda x: x[None], (task, start, scenes[2][0]))
     states, actions = receding.demonstrate(cart, SETTINGS, 0.0, *alone)
@@ -57,13 +57,25 @@ def test_plans_are_made_in_the_approximation_and_executed_in_the_world(cart, sce
     state, search = start, sampling.start(jnp.zeros((4, 1)), 0.5)
     at = np.linspace(0, 7, 4)
     moved = lambda knots: np.interp(np.clip(at + 1, 0, 7), at, knots[:, 0])[:, None]  # noqa: E731
-    for now, key in enumerate(jax.random.split(scenes[2][0], 12)):
+    for now, key in enumerate(jax.random.split(jax.random.key(0), 12)):
         found = sampling.solve(problem, state.vector, search, 8, jax.random.split(key)[0], SETTINGS.search)
         action = np.clip(found.knots[0], -2, 2) / 2
         np.testing.assert_allclose(actions[0, now], action, atol=1e-5)
         state = cart.step(task, state, action)
         np.testing.assert_allclose(states.qpos[0, now + 1], state.qpos, atol=1e-5)
         search = sampling.start(moved(found.knots), 0.5)._replace(best=jnp.asarray(moved(found.best)))
+
+
+def test_only_noise_tells_two_demonstrations_of_a_scene_apart(cart, scenes):
+    task, start = jax.tree.map(lambda x: jnp.repeat(x[:1], len(x), axis=0), scenes[:2])
+    _, alike = receding.demonstrate(cart, SETTINGS, 0.0, task, start, scenes[2])
+    np.testing.assert_allclose(alike, jnp.repeat(alike[:1], len(alike), axis=0), atol=1e-6)
+    states, actions = receding.demonstrate(cart, SETTINGS, NOISE, task, start, scenes[2])
+    driven = np.diff(states.qvel[..., 0], axis=1) / 0.25
+    drawn = np.where(np.abs(driven) < 0.99, driven - actions[..., 0], np.nan)
+    apart, count = drawn - np.nanmean(drawn, axis=0), np.isfinite(drawn).sum()
+    assert count > 300
+    np.testing.assert_allclose(np.sqrt(np.nanmean(apart**2)), NOISE, rtol=3 / np.sqrt(2 * count))
 
 
 def test_scenes_do_not_depend_on_those_beside_them(cart, scenes):
