@@ -28,6 +28,8 @@ platform.pixel_options = dict
 # Compiling takes longer than running here.
 _FLAGS = ("backend_optimization_level=0", "llvm_disable_expensive_passes=true", "cpu_parallel_codegen_split_count=1")
 os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *(f"--xla_{flag}" for flag in _FLAGS)])
+# Where in the source an operation comes from would be written down for each of them.
+jax.config.update("jax_traceback_in_locations_limit", 0)
 # Tracing makes very many objects: a collection after every 700 of them would find little to free.
 gc.freeze()
 gc.set_threshold(50_000)
