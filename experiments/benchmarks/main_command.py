@@ -45,7 +45,8 @@ def run(source: pathlib.Path, workdir: pathlib.Path, cache: pathlib.Path, to_the
     command = [sys.executable, "-m", "milx.train", f"--env={_ENV.value}", "--preset=cpu", f"--workdir={workdir}"]
     began, first, metrics = time.perf_counter(), float("nan"), workdir / "metrics.jsonl"
     silent = subprocess.DEVNULL
-    process = subprocess.Popen(command, env=environment, cwd=source, stdout=silent, stderr=silent)  # `-m` looks here
+    # `-m` looks for the package in `cwd` first.
+    process = subprocess.Popen(command, env=environment, cwd=source, stdout=silent, stderr=silent)
     while not (ended := os.wait4(process.pid, os.WNOHANG))[0]:
         if math.isnan(first) and metrics.is_file() and metrics.stat().st_size:
             first = time.perf_counter() - began

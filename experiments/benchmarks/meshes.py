@@ -122,7 +122,7 @@ def main(_: list[str]) -> None:
             report.measure(
                 f"{name}: milx, kernel", "frames/s", functools.partial(render.measure_milx, some, renderer.paint), note
             )
-        poses = jnp.asarray(qpos[:count], float), jnp.zeros((count, model.nmocap, 3))
+        poses = jnp.asarray(qpos[:count], float), jnp.tile(jnp.asarray(mujoco.MjData(model).mocap_pos), (count, 1, 1))
         report.attempt(
             f"{name}: MJX-Warp",
             "frames/s",

@@ -31,10 +31,10 @@ def table(results: list[dict]) -> str:
 
 
 def draw(results: list[dict], path: pathlib.Path) -> None:
-    """Draws one panel of bars for every file, without what was not run; peers are gray."""
+    """Draws one panel of bars for every file, without shares and what was not run; peers are gray."""
     figure, axes = plt.subplots(len(results), 1, figsize=(9, 2.2 * len(results)), squeeze=False, layout="constrained")
     for axis, result in zip(axes[:, 0], results, strict=True):
-        rows = [row for row in result["rows"] if row["median"] is not None]
+        rows = [row for row in result["rows"] if row["median"] is not None and not row["unit"].startswith("%")]
         labels = [f"{row['name']} ({row['unit']})" for row in rows]
         medians = [row["median"] for row in rows]
         peers = [any(peer in row["name"] for peer in PEERS) for row in rows]

@@ -27,7 +27,6 @@ from milx.envs.base import Env, State, Task
 from milx.evaluation import provenance
 from milx.trajopt import ilqr, sampling
 from milx.trajopt.episode import approximated, steered
-from milx.trajopt.ilqr import Problem
 from milx.trajopt.planner import Planner, Settings
 
 ITERATIONS = (2, 8)
@@ -38,15 +37,9 @@ SEED = 2000
 """Of the scenes, which no other script draws."""
 
 
-def problem_of(env: Env, task: Task, start: State) -> Problem:
-    """States what both improve."""
-    problem = approximated(steered(env, task, start))
-    return problem._replace(approximation=problem.dynamics)
-
-
 def judged(env: Env, task: Task, start: State, actions: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Rolls out controls [T, k]: their cost, and whether they succeed."""
-    problem = problem_of(env, task, start)
+    problem = approximated(steered(env, task, start))
 
     def step(x: jax.Array, inputs: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
         u, t = inputs
@@ -63,13 +56,13 @@ def searched(env: Env, settings: Settings, iterations: int, task: Task, start: S
     """Searches from nothing, and returns the controls [T, k]."""
     planner = Planner(env, settings)
     search = planner.improve(task, start, planner.begin(), key, iterations)
-    return sampling.actions_of(problem_of(env, task, start), search.knots, env.horizon, settings.search)
+    return sampling.actions_of(planner.problem(task, start), search.knots, env.horizon, settings.search)
 
 
 def polished(env: Env, iterations: int, task: Task, start: State, actions: jax.Array) -> jax.Array:
     """Improves controls [T, k] by iLQR, and returns those of the plan."""
     options = ilqr.Options(iterations=iterations)
-    return ilqr.solve(problem_of(env, task, start), start.vector, actions, options).actions
+    return ilqr.solve(approximated(steered(env, task, start)), start.vector, actions, options).actions
 
 
 def timed(function: Callable[..., jax.Array], *args: Any) -> tuple[jax.Array, float]:
@@ -113,7 +106,12 @@ def main(_: list[str]) -> None:
     results = {}
     for name in _ENVS.value:
         results[name] = measure(envs.make(name, (16, 16)), _SCENES.value)
-        said = {"scenes": _SCENES.value, "first_seed": SEED, "settings": dataclasses.asdict(Settings())}
+        said = {
+            "scenes": _SCENES.value,
+            "first_seed": SEED,
+            "settings": dataclasses.asdict(Settings()),
+            "ilqr": dataclasses.asdict(ilqr.Options()),
+        }
         path = pathlib.Path(_OUT.value) / "polish.json"
         path.parent.mkdir(parents=True, exist_ok=True)
         files.write_json(path, {**said, "results": results, **provenance.origin()})

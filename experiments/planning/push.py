@@ -7,6 +7,7 @@ The planner (`milx.trajopt.planner`) samples velocities of the hand, which an op
 It plans whole episodes for an arm without noise: in the first scenes from nothing, in other scenes from the cheapest of
 the plans of the nearest of the first. Then it executes these under the presets' noise on the actions, in four ways: as
 they are, tracking the path of the hand that the plan expects, planning the rest again every few time steps, or both.
+Searches draw candidates of their own in every scene, otherwise than demonstrations, where all scenes draw the same.
 """
 
 import dataclasses

@@ -57,7 +57,8 @@ class DataConfig:
         plan_iterations: iterations of trajectory optimization for a demonstration: with "ilqr" their maximum number, or
             0 to use the environment's controller instead; with "sampling" their number, 8 in the results that are
             reported; with "receding" their number in each of many plans, for which 1 is enough.
-        plan_batch: demonstrations planned at once; by sampling each of them rolls out 64 plans at once.
+        plan_batch: demonstrations planned at once; with "sampling" each of them rolls out 64 plans at once, with
+            "receding" 96.
     """
 
     tasks: int = 1500

@@ -29,6 +29,8 @@ from milx.trajopt.sampling import Options, Search
 
 SEARCH = Options("cross_entropy", samples=32, iterations=8, order=3, elites=6, deviation_min=0.03)
 AGAIN = Options("cross_entropy", samples=32, order=3, elites=6)
+_FIRST, _LATER = 0, 1
+"""Seeds of the candidates of searches and of what is planned again, the same in all scenes."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -166,7 +168,7 @@ class Planner:
         search = search._replace(deviation=jnp.broadcast_to(self._near, search.deviation.shape))
         problem, own = self.problem(task, start), jax.random.bits(key)
         states, actions = replanning.execute(
-            problem, start.vector, search, env.horizon, every, jax.random.key(0), settings.again, plant
+            problem, start.vector, search, env.horizon, every, jax.random.key(_LATER), settings.again, plant
         )
         return jax.vmap(start.with_vector)(states), actions
 
@@ -203,7 +205,7 @@ def demonstrate(
     def one(plans: Plans, noise: jax.Array, task: Task, start: State, key: jax.Array) -> tuple[State, jax.Array]:
         planner = Planner(env, settings)
         search = planner.begin_from(task, start, plans)
-        search = planner.improve(task, start, search, jax.random.key(0), settings.search.iterations)
+        search = planner.improve(task, start, search, jax.random.key(_FIRST), settings.search.iterations)
         return planner.execute(task, start, search, key, noise)
 
     batched = jax.vmap(one, in_axes=(None, None, 0, 0, 0))
@@ -218,7 +220,7 @@ def find_plans(env: Env, settings: Settings, noise: jax.Array | float, key: jax.
         env: the environment.
         settings: of the planner, of which `scenes` is M.
         noise: standard deviation of the noise on the actions, in their units.
-        key: draws all that is random.
+        key: draws tasks, scenes, noise, and the candidates of the searches.
 
     Returns:
         The plans [M], those that failed among them.
@@ -246,7 +248,7 @@ def share_plans(env: Env, settings: Settings, plans: Plans, noise: jax.Array | f
         settings: of the planner; `rounds` and `enough` say for how long.
         plans: what `find_plans` returned for the other arguments.
         noise: standard deviation of the noise on the actions, in their units.
-        key: draws all that is random.
+        key: draws tasks, scenes, noise, and the candidates of the searches.
 
     Returns:
         The plans [M]; those that had succeeded are unchanged.

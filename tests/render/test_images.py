@@ -7,6 +7,7 @@ import pytest
 import scipy.ndimage
 
 from milx.render import Renderer, images
+from milx.render.scene import to_uint8
 
 HEIGHT, WIDTH, ROWS, COLUMNS = 30, 40, 5, 7
 QUAD = """<mujoco><statistic extent="1"/><visual><headlight active="0"/></visual><worldbody>
@@ -94,6 +95,22 @@ def test_the_kernel_refuses_textures():
     renderer = Renderer(model, "eye", 16, 16)
     with pytest.raises(ValueError, match="got shadows, or meshes with textures, expected neither: use render"):
         renderer.paint(renderer.scene(data), interpret=True)
+
+
+@pytest.mark.parametrize(
+    ("mesh", "shadows", "by_kernel"), [("bare", False, True), ("bare", True, False), ("seen", False, False)]
+)
+def test_a_gpu_draws_by_the_kernel_what_the_kernel_can_draw(monkeypatch, mesh, shadows, by_kernel):
+    texels = np.random.default_rng(0).integers(0, 256, (ROWS, COLUMNS, 3), np.uint8)
+    model, data = square({"noise": texels}, [("noise", mesh, [0, 0, 0])])
+    renderer, paint, calls = Renderer(model, "eye", 16, 16, shadows=shadows), Renderer.paint, []
+    scene = renderer.scene(data)
+    expected = np.asarray(to_uint8(renderer.render(scene).color), int)
+    monkeypatch.setattr(Renderer, "paint", lambda *given: calls.append(given) or paint(*given, interpret=True))
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert np.abs(renderer.pixels(scene) - expected).max() <= 1
+    assert len(calls) == by_kernel
+    assert expected.std() > 20
 
 
 def test_without_a_texture_nothing_is_kept():

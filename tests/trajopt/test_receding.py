@@ -76,6 +76,8 @@ def test_only_noise_tells_two_demonstrations_of_a_scene_apart(cart, scenes):
     apart, count = drawn - np.nanmean(drawn, axis=0), np.isfinite(drawn).sum()
     assert count > 300
     np.testing.assert_allclose(np.sqrt(np.nanmean(apart**2)), NOISE, rtol=3 / np.sqrt(2 * count))
+    neighbors = apart[:, 1:] * apart[:, :-1] / NOISE**2
+    assert abs(np.nanmean(neighbors)) < 3 / np.sqrt(np.isfinite(neighbors).sum()), "every step draws its own"
 
 
 def test_scenes_do_not_depend_on_those_beside_them(cart, scenes):
