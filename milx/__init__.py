@@ -55,6 +55,7 @@ _PACKAGES = (
     "deploy",
     "envs",
     "evaluation",
+    "meta",
     "methods",
     "networks",
     "render",

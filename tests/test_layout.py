@@ -9,7 +9,7 @@ import pytest
 
 ROOT = pathlib.Path(__file__).parents[1]
 FLOORS = (
-    {"types", "core"},
+    {"types", "core", "meta"},
     {"config", "render"},
     {"networks", "envs"},
     {"methods", "trajopt"},

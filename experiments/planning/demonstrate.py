@@ -67,6 +67,7 @@ def main(_: list[str]) -> None:
     os.environ["XDG_CACHE_HOME"] = temporary.name
     os.environ.pop("JAX_COMPILATION_CACHE_DIR", None)
     milx.configure()
+    origin = provenance.origin()  # before a file of another commit is replaced
     folder = pathlib.Path(_OUT.value)
     folder.mkdir(parents=True, exist_ok=True)
     for name in _ENVS.value:
@@ -82,7 +83,7 @@ def main(_: list[str]) -> None:
         )
         for found in measure(env, config, _SCENES.value):
             said = {"env": name, "data": dataclasses.asdict(config), "settings": settings}
-            result = {**said, **found, **provenance.origin()}
+            result = {**said, **found, **origin}
             file = f"demonstrations-{name}.json" if expert == "sampling" else f"demonstrations-{name}-{expert}.json"
             files.write_json(folder / file, result)
             (low, high), newest = found["wilson95"], found["success_by_batch"][-1]

@@ -103,7 +103,7 @@ def measure(env: Env, scenes: int) -> dict[str, dict[str, float]]:
 def main(_: list[str]) -> None:
     """Measures, and writes the file."""
     milx.configure()
-    results = {}
+    results, origin = {}, provenance.origin()  # before the file of another commit is replaced
     for name in _ENVS.value:
         results[name] = measure(envs.make(name, (16, 16)), _SCENES.value)
         said = {
@@ -114,7 +114,7 @@ def main(_: list[str]) -> None:
         }
         path = pathlib.Path(_OUT.value) / "polish.json"
         path.parent.mkdir(parents=True, exist_ok=True)
-        files.write_json(path, {**said, "results": results, **provenance.origin()})
+        files.write_json(path, {**said, "results": results, **origin})
 
 
 if __name__ == "__main__":

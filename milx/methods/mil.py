@@ -14,13 +14,12 @@ which is eq. 2 but for the factor m^2 / (K T A). Where d shows no actions the in
 """
 
 import dataclasses
-import functools
-from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
+from milx import meta
 from milx.config.schema import GIVEN, Config, MethodConfig, number
 from milx.methods.base import Method
 from milx.methods.imitation import (
@@ -70,31 +69,6 @@ class MILConfig(MethodConfig):
     sharpness: float = number(1.0, 0)
 
 
-@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
-def gradient(loss: Callable[..., jax.Array], theta: Params, *data: Any) -> Params:
-    """Differentiates loss(theta, *data); the result is differentiable in theta, in reverse; `data` is constant.
-
-    Its derivative is a product of the Hessian with a vector. As the Hessian is symmetric (`loss` must not stop the
-    gradient of a part of theta in one place and use it in another), the product may be taken forward over reverse,
-    which keeps no intermediate results of the inner gradient for the meta-gradient (Pearlmutter 1994), where reverse
-    over reverse keeps them all.
-    """
-    return jax.grad(loss)(theta, *data)
-
-
-def _gradient_forward(loss: Callable[..., jax.Array], theta: Params, *data: Any) -> tuple[Params, tuple]:
-    return jax.grad(loss)(theta, *data), (theta, *data)
-
-
-def _gradient_backward(loss: Callable[..., jax.Array], inputs: tuple, vector: Params) -> tuple:
-    theta, *data = inputs
-    _, product = jax.jvp(lambda theta: jax.grad(loss)(theta, *data), (theta,), (vector,))
-    return product, *(None for _ in data)
-
-
-gradient.defvjp(_gradient_forward, _gradient_backward)
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class MIL(Method):
     """Meta-imitation learning with one or two heads.
@@ -137,31 +111,31 @@ class MIL(Method):
 
         Then the weights of the votes of a goal head are raised to the power of `config.sharpness`.
         """
-        theta = self._steps(params, demo)[-1]
+        theta = self._steps(params, demo)
         if self.config.sharpness != 1 and "goal_head" in (controller := theta["controller"]):
             head = sharpen(controller["goal_head"], self.config.sharpness)
             theta = {**theta, "controller": {**controller, "goal_head": head}}
         return {"policy": theta, "whitening": params["whitening"]}
 
-    def _steps(self, params: Params, demo: Demo) -> list[Params]:
-        """Takes the inner steps, and returns the network's parameters before them and after each."""
+    def _steps(self, params: Params, demo: Demo, path: bool = False) -> Params:
+        """Takes the inner steps: the network's parameters after them, or after each with a leading axis."""
         theta, demo = params["policy"], shown(demo, self.config.given, params["whitening"])
         demo = self._with_goal_in_hindsight(params, demo)
-        rates = jax.tree.map(lambda _: self.config.inner_lr, theta)
+        rate: Any = self.config.inner_lr
         if self.config.learn_inner_lr:
-            rates = jax.tree.map(lambda s: self.config.inner_lr * jnp.exp(s), params["inner_log_lr"])
-        adapts, clip, thetas = self._adapted(theta), self.config.inner_clip, [theta]
-
-        def step(p: jax.Array, g: jax.Array, rate: jax.Array | float, adapts: bool) -> jax.Array:
-            return p - rate * jnp.clip(g, -clip, clip) if adapts else p
-
-        for _ in range(self.config.inner_steps):
-            grad = gradient(self._inner_loss, theta, params["whitening"], demo)
-            if self.config.first_order:
-                grad = jax.lax.stop_gradient(grad)
-            theta = jax.tree.map(step, theta, grad, rates, adapts)
-            thetas.append(theta)
-        return thetas
+            rate = jax.tree.map(lambda s: self.config.inner_lr * jnp.exp(s), params["inner_log_lr"])
+        return meta.adapt(
+            self._inner_loss,
+            theta,
+            params["whitening"],
+            demo,
+            steps=self.config.inner_steps,
+            rate=rate,
+            clip=self.config.inner_clip,
+            mask=self._adapted(theta),
+            order="first_order" if self.config.first_order else "forward_over_reverse",
+            path=path,
+        )
 
     def _adapted(self, theta: Params) -> Params:
         """Tells which tensors the inner step changes, a bool for each."""
@@ -185,18 +159,20 @@ class MIL(Method):
         """Computes the meta-objective, averaged over the tasks, and its parts, [N].
 
         With the variant "multi_step" it is sum over i = 1..n of w_i L(theta_i, d'), theta_i being the parameters after
-        i of the n inner steps: w_i = (1 - progress) / n for i < n, and w_n is what they leave of 1 (Antoniou et al.
-        2019, Section 4). A hindsight head learns from the queries beside it, unadapted, as the inner step uses it.
+        i of the n inner steps, with the weights of `meta.multi_step_loss` (Antoniou et al. 2019, Section 4).
+        A hindsight head learns from the queries beside it, unadapted, as the inner step uses it.
         """
 
         def task_loss(support: Demo, query: Demo) -> tuple[jax.Array, dict[str, jax.Array]]:
-            *earlier, adapted = self._steps(params, support)
-            loss, metrics = self._query_loss(params, adapted, query)
-            if self.config.variant == "multi_step":
-                losses = [self._query_loss(params, theta, query)[0] for theta in earlier[1:]]
-                weight = (1 - progress) / self.config.inner_steps
-                loss = (1 - weight * len(losses)) * loss + weight * sum(losses)
-            return loss, metrics
+            if self.config.variant != "multi_step":
+                return self._query_loss(params, self._steps(params, support), query)
+            thetas = self._steps(params, support, path=True)
+            found = [
+                self._query_loss(params, jax.tree.map(lambda x, i=i: x[i], thetas), query)
+                for i in range(self.config.inner_steps)
+            ]
+            loss = meta.multi_step_loss(jnp.stack([loss for loss, _ in found]), progress)
+            return loss, found[-1][1]
 
         loss, metrics = jax.vmap(task_loss)(batch.support, batch.query)
         return loss.mean(), {"loss": loss, **metrics}

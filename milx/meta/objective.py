@@ -1,0 +1,59 @@
+"""What is minimized over tasks, and its gradient within a bound on memory."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+
+def multi_step_loss(losses: jax.Array, progress: jax.Array | float) -> jax.Array:
+    """Weighs the losses [K] after each of K inner steps: sum over k of w_k L_k (Antoniou et al. 2019, Section 4).
+
+    With the progress p of training, from 0 to 1, w_k = (1 - p) / K for k < K, and w_K is what they leave of 1: first
+    all steps count alike, and at the end the last one alone.
+    """
+    weight = (1 - progress) / len(losses)
+    return weight * losses[:-1].sum() + (1 - weight * (len(losses) - 1)) * losses[-1]
+
+
+def meta_gradient(
+    task_loss: Callable[[Any, Any], jax.Array], params: Any, tasks: Any, at_once: int | None = None
+) -> tuple[Any, jax.Array]:
+    """Computes the gradient of the mean over tasks of task_loss(params, task).
+
+    Args:
+        task_loss: the loss of one task, a scalar, in which `adapt` or `implicit_adapt` may be called.
+        params: what it is differentiated by.
+        tasks: N of them, a pytree whose leaves have this leading axis.
+        at_once: how many tasks are worked on at the same time, at most, which bounds memory; None for all. The number
+            is the largest divisor of N that is not larger.
+
+    Returns:
+        The gradient, as `params`, and the losses [N].
+
+    Raises:
+        ValueError: if no task is to be worked on at once.
+    """
+    count = len(jax.tree.leaves(tasks)[0])
+    if at_once is not None and at_once < 1:
+        raise ValueError(f"at_once: got {at_once}, expected at least 1, or None")
+
+    def of_group(tasks: Any) -> tuple[Any, jax.Array]:
+        def mean(params: Any) -> tuple[jax.Array, jax.Array]:
+            losses = jax.vmap(task_loss, in_axes=(None, 0))(params, tasks)
+            return losses.mean(), losses
+
+        return jax.grad(mean, has_aux=True)(params)
+
+    size = max(size for size in range(1, count + 1) if count % size == 0 and size <= (at_once or count))
+    if size == count:
+        return of_group(tasks)
+
+    def add(total: Any, group: Any) -> tuple[Any, jax.Array]:
+        gradient, losses = of_group(group)
+        return jax.tree.map(jnp.add, total, gradient), losses
+
+    groups = jax.tree.map(lambda x: x.reshape(count // size, size, *x.shape[1:]), tasks)
+    total, losses = jax.lax.scan(add, jax.tree.map(jnp.zeros_like, params), groups)
+    return jax.tree.map(lambda x: x / (count // size), total), losses.reshape(count)

@@ -1,0 +1,96 @@
+"""The mean over tasks, the weights of steps, and implicit derivatives, against closed forms, in double precision."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from milx import meta
+
+
+@pytest.fixture(autouse=True, scope="module")
+def float64():
+    with jax.enable_x64(True):
+        yield
+
+
+RNG = np.random.default_rng(2)
+ROOT = RNG.normal(size=(4, 4))
+MATRIX = ROOT @ ROOT.T / 4 + np.eye(4)
+START = {"a": RNG.normal(size=3), "b": RNG.normal(size=())}
+SUPPORT, QUERY = RNG.normal(size=(2, 6, 4))
+
+
+def flat(theta):
+    return jnp.append(theta["a"], theta["b"])
+
+
+def bowl(theta, center):
+    return 0.5 * (flat(theta) - center) @ MATRIX @ (flat(theta) - center)
+
+
+def task_loss(theta, task):
+    support, query = task
+    return bowl(meta.adapt(bowl, theta, support, steps=2, rate=0.1), query)
+
+
+@pytest.mark.parametrize("at_once", [None, 1, 4, 6, 9])
+def test_the_meta_gradient_is_the_mean_of_the_tasks_however_many_are_worked_on_at_once(at_once):
+    found, losses = jax.jit(lambda theta: meta.meta_gradient(task_loss, theta, (SUPPORT, QUERY), at_once))(START)
+    each = [jax.value_and_grad(task_loss)(START, task) for task in zip(SUPPORT, QUERY, strict=True)]
+    np.testing.assert_allclose(losses, [loss for loss, _ in each], rtol=1e-12)
+    for name in START:
+        np.testing.assert_allclose(found[name], np.mean([grad[name] for _, grad in each], axis=0), rtol=1e-12)
+
+
+def test_no_task_at_once_is_refused():
+    with pytest.raises(ValueError, match="at_once: got 0, expected at least 1, or None"):
+        meta.meta_gradient(task_loss, START, (SUPPORT, QUERY), 0)
+
+
+@pytest.mark.parametrize(("progress", "weights"), [(0, [1 / 3, 1 / 3, 1 / 3]), (1, [0, 0, 1]), (0.4, [0.2, 0.2, 0.6])])
+def test_the_weights_of_steps_move_to_the_last(progress, weights):
+    losses = jnp.asarray(RNG.normal(size=3))
+    np.testing.assert_allclose(meta.multi_step_loss(losses, progress), losses @ np.array(weights), rtol=1e-12)
+
+
+def test_implicit_adaptation_finds_the_regularized_minimum_and_its_derivative():
+    """phi = (A + lambda I)^-1 (A c + lambda theta), and d phi / d theta = lambda (A + lambda I)^-1."""
+    strength = 0.7
+
+    def query(theta):
+        phi = meta.implicit_adapt(bowl, theta, SUPPORT[0], steps=200, rate=0.3, strength=strength)
+        return bowl(phi, QUERY[0]), phi
+
+    found, phi = jax.jit(jax.grad(query, has_aux=True))(START)
+    regularized = MATRIX + strength * np.eye(4)
+    minimum = np.linalg.solve(regularized, MATRIX @ SUPPORT[0] + strength * flat(START))
+    np.testing.assert_allclose(flat(phi), minimum, rtol=1e-8)
+    expected = strength * np.linalg.solve(regularized, MATRIX @ (minimum - QUERY[0]))
+    np.testing.assert_allclose(flat(found), expected, rtol=1e-7)
+
+
+def test_implicit_and_unrolled_derivatives_agree_where_steps_converge():
+    """Not on a bowl: the loss has a third derivative."""
+
+    def steep(theta, center):
+        return bowl(theta, center) + jnp.sum(jnp.cosh(flat(theta) - center))
+
+    def near(theta, origin, center):
+        return steep(theta, center) + 0.5 * jnp.sum(jnp.square(flat(theta) - flat(origin)))
+
+    def implicit(theta):
+        return bowl(meta.implicit_adapt(steep, theta, SUPPORT[0], steps=300, rate=0.1, strength=1.0), QUERY[0])
+
+    def unrolled(theta):
+        order = "reverse_over_reverse"  # which differentiates by the origin, too
+        return bowl(meta.adapt(near, theta, theta, SUPPORT[0], steps=300, rate=0.1, order=order), QUERY[0])
+
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-7), jax.grad(implicit)(START), jax.grad(unrolled)(START)
+    )
+
+
+def test_a_strength_that_holds_nothing_is_refused():
+    with pytest.raises(ValueError, match="strength: got 0, expected more than 0"):
+        meta.implicit_adapt(bowl, START, SUPPORT[0], steps=1, rate=0.1, strength=0)
