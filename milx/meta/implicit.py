@@ -35,18 +35,20 @@ def implicit_adapt(
         params: theta.
         data: other arguments of the loss, constants to a meta-gradient.
         steps: of gradient descent on the regularized loss.
-        rate: of these steps, as in `adapt`.
-        strength: lambda.
+        rate: of these steps, as in `adapt`; a constant to a meta-gradient.
+        strength: lambda, a number that is not traced. The larger it is, the more is convex.
         iterations: of conjugate gradients, at most.
 
     Returns:
         phi, as `params`.
 
     Raises:
-        ValueError: as `adapt`; for a strength that is not positive.
+        ValueError: as `adapt`; for a strength that is not positive, or no iteration.
     """
-    if strength <= 0:
+    if not strength > 0:
         raise ValueError(f"strength: got {strength}, expected more than 0")
+    if iterations < 1:
+        raise ValueError(f"iterations: got {iterations}, expected at least 1")
     return _minimum(loss, steps, float(strength), iterations, params, rate, *data)
 
 
@@ -66,12 +68,14 @@ def _forward(loss: Loss, steps: int, strength: float, iterations: int, params: A
 
 def _backward(loss: Loss, steps: int, strength: float, iterations: int, kept: tuple, vector: Any) -> tuple:
     phi, data = kept
+    wide = jnp.result_type(jnp.float32, *jax.tree.leaves(phi))  # conjugate gradients need one type
 
     def regularized(v: Any) -> Any:
-        return jax.tree.map(lambda v, h: v + h / strength, v, hessian_product(loss, phi, data, v))
+        narrow = jax.tree.map(lambda v, p: v.astype(p.dtype), v, phi)
+        return jax.tree.map(lambda v, h: v + h.astype(wide) / strength, v, hessian_product(loss, phi, data, narrow))
 
-    found, _ = cg(regularized, vector, maxiter=iterations)
-    return found, None, *(None for _ in data)
+    found, _ = cg(regularized, jax.tree.map(lambda x: x.astype(wide), vector), maxiter=iterations)
+    return jax.tree.map(lambda x, p: x.astype(p.dtype), found, phi), None, *(None for _ in data)
 
 
 _minimum.defvjp(_forward, _backward)

@@ -33,18 +33,24 @@ def meta_gradient(
         The gradient, as `params`, and the losses [N].
 
     Raises:
-        ValueError: if no task is to be worked on at once.
+        ValueError: if there is no task, or the leaves have several leading axes; if no task is to be worked on at once;
+            if a task's loss is no scalar.
     """
-    count = len(jax.tree.leaves(tasks)[0])
+    shapes = {jnp.shape(leaf)[:1] for leaf in jax.tree.leaves(tasks)}
+    if len(shapes) != 1 or not (count := sum(next(iter(shapes)))):
+        raise ValueError(f"tasks: got the leading axes {sorted(shapes)}, expected one of at least 1")
     if at_once is not None and at_once < 1:
         raise ValueError(f"at_once: got {at_once}, expected at least 1, or None")
 
     def of_group(tasks: Any) -> tuple[Any, jax.Array]:
-        def mean(params: Any) -> tuple[jax.Array, jax.Array]:
+        def mean_loss(params: Any) -> tuple[jax.Array, jax.Array]:
             losses = jax.vmap(task_loss, in_axes=(None, 0))(params, tasks)
+            if not isinstance(losses, jax.Array) or losses.ndim != 1:
+                got = jax.tree.map(lambda x: jnp.shape(x)[1:], losses)
+                raise ValueError(f"task_loss: got what has the shape {got}, expected a scalar")
             return losses.mean(), losses
 
-        return jax.grad(mean, has_aux=True)(params)
+        return jax.grad(mean_loss, has_aux=True)(params)
 
     size = max(size for size in range(1, count + 1) if count % size == 0 and size <= (at_once or count))
     if size == count:
@@ -52,8 +58,11 @@ def meta_gradient(
 
     def add(total: Any, group: Any) -> tuple[Any, jax.Array]:
         gradient, losses = of_group(group)
-        return jax.tree.map(jnp.add, total, gradient), losses
+        return jax.tree.map(lambda total, x: total + x.astype(total.dtype), total, gradient), losses
 
-    groups = jax.tree.map(lambda x: x.reshape(count // size, size, *x.shape[1:]), tasks)
-    total, losses = jax.lax.scan(add, jax.tree.map(jnp.zeros_like, params), groups)
-    return jax.tree.map(lambda x: x / (count // size), total), losses.reshape(count)
+    groups = jax.tree.map(lambda x: jnp.reshape(x, (count // size, size, *jnp.shape(x)[1:])), tasks)
+    params = jax.tree.map(jnp.asarray, params)
+    zeros = jax.tree.map(lambda p: jnp.zeros(p.shape, jnp.promote_types(p.dtype, jnp.float32)), params)
+    total, losses = jax.lax.scan(add, zeros, groups)
+    mean = jax.tree.map(lambda x, p: (x / (count // size)).astype(p.dtype), total, params)
+    return mean, losses.reshape(count)

@@ -1,13 +1,13 @@
 """Steps of gradient descent that can be differentiated, on any loss and any pytree of parameters.
 
-With a loss L(theta, data), rates alpha_k, a bound c and a mask M of zeros and ones, step k is
+With a loss L(theta, data), and for every tensor of theta a rate alpha_k, a mask M, 0 or 1, and a bound c on the entries
+of its gradient, step k is
 
-    theta_{k+1} = theta_k - M alpha_k clip(grad_theta L(theta_k, data), -c, c),
+    theta_{k+1} = theta_k - M alpha_k clip(grad_theta L(theta_k, data), -c, c).
 
-entry by entry. Masks make relatives of MAML (Finn et al. 2017): all but the last layer kept (ANIL, Raghu et al. 2020),
-the last layer kept (BOIL, Oh et al. 2021), all but a few context parameters kept (CAVIA, Zintgraf et al. 2019).
-Rates that are part of what is meta-learned make Meta-SGD (Li et al. 2017), one for every tensor and step MAML++
-(Antoniou et al. 2019).
+Masks make relatives of MAML (Finn et al. 2017): all but the last layer kept (ANIL, Raghu et al. 2020), the last layer
+kept (BOIL, Oh et al. 2021), all but a few context parameters kept (CAVIA, Zintgraf et al. 2019). Rates may be part of
+what is meta-learned, one for every tensor and step in MAML++ (Antoniou et al. 2019).
 """
 
 import functools
@@ -19,10 +19,12 @@ import jax.numpy as jnp
 import numpy as np
 
 Loss = Callable[..., jax.Array]
-"""Maps parameters, a pytree of arrays, and data to a scalar. It must not close over what is differentiated by."""
+"""Maps parameters, a pytree of floating-point arrays, and data, pytrees of arrays, to a scalar. It must not close over
+a value that JAX traces: what belongs to a task is passed as data."""
 ORDERS = ("forward_over_reverse", "reverse_over_reverse", "first_order")
 """How the derivative of an inner gradient is taken: its product of the Hessian with a vector forward over reverse or
-reverse over reverse, which give the same, or not at all."""
+reverse over reverse, which give the same by the parameters, or not at all. Only reverse over reverse differentiates by
+the data, too; to the others they are constants, so what is meta-learned belongs into the parameters."""
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
@@ -58,7 +60,7 @@ def gradient(loss: Loss, params: Any, *data: Any, order: str = ORDERS[0]) -> Any
     Args:
         loss: what is differentiated.
         params: where.
-        data: other arguments of the loss; with the first order of ORDERS they are constants to a meta-gradient.
+        data: other arguments of the loss, constants to a meta-gradient unless `order` is "reverse_over_reverse".
         order: one of ORDERS.
 
     Raises:
@@ -86,9 +88,10 @@ def inner_step(
     Args:
         loss: what descends.
         params: theta_k.
-        data: other arguments of the loss.
-        rate: alpha_k, scalars: one, or a pytree whose structure is that of `params`, or the beginning of it.
-        clip: c; None for no bound.
+        data: other arguments of the loss, as in `gradient`.
+        rate: alpha_k, scalars: one, or a pytree whose structure is that of `params`, or the beginning of it, of the
+            same types of nodes.
+        clip: c, a number; None for no bound.
         mask: bools: one, or a pytree as `rate`. Tensors with False stay as they are.
         order: one of ORDERS.
 
@@ -96,8 +99,16 @@ def inner_step(
         theta_{k+1}, in the data types of `params`.
 
     Raises:
-        ValueError: as `gradient`; for a rate or a mask with another structure.
+        ValueError: as `gradient`; for a rate or a mask with another structure, a rate that is no scalar, a mask that is
+            no bool, or a negative bound.
     """
+    if clip is not None and clip < 0:
+        raise ValueError(f"clip: got {clip}, expected at least 0, or None")
+    params = jax.tree.map(jnp.asarray, params)
+    rates = _for_every_tensor("rate", rate, params)
+    for value in jax.tree.leaves(rates):
+        if jnp.ndim(value):
+            raise ValueError(f"rate: got the shape {jnp.shape(value)}, expected a scalar")
 
     def step(p: jax.Array, g: jax.Array, rate: jax.Array | float, adapts: bool) -> jax.Array:
         if not adapts:
@@ -106,7 +117,7 @@ def inner_step(
         return (p - rate * bounded).astype(p.dtype)
 
     found = gradient(loss, params, *data, order=order)
-    return jax.tree.map(step, params, found, _for_every_tensor("rate", rate, params), _mask(mask, params))
+    return jax.tree.map(step, params, found, rates, _mask(mask, params))
 
 
 def adapt(
@@ -120,12 +131,12 @@ def adapt(
     order: str = ORDERS[0],
     path: bool = False,
 ) -> Any:
-    """Takes K steps of gradient descent, in a scan if there are several.
+    """Takes K steps of gradient descent, in a scan if there are several; it can be differentiated in reverse.
 
     Args:
         loss: what descends.
         params: theta_0.
-        data: other arguments of the loss, the same in all steps.
+        data: other arguments of the loss, as in `gradient`, the same in all steps.
         steps: K; with none `params` are returned.
         rate: as in `inner_step`; instead of a scalar, an array [K] has a rate for every step.
         clip: as in `inner_step`.
@@ -138,6 +149,7 @@ def adapt(
     """
     if steps < 0:
         raise ValueError(f"steps: got {steps}, expected at least 0")
+    params = jax.tree.map(jnp.asarray, params)
     rates = jax.tree.map(lambda rate: _for_every_step(rate, steps), _for_every_tensor("rate", rate, params))
 
     def take(params: Any, rates: Any) -> tuple[Any, Any]:
@@ -147,7 +159,7 @@ def adapt(
     if steps == 1:  # a loop of one step would be slower to compile
         last, _ = take(params, jax.tree.map(lambda rate: rate[0], rates))
         return jax.tree.map(lambda x: x[None], last) if path else last
-    last, visited = jax.lax.scan(take, jax.tree.map(jnp.asarray, params), rates, length=steps)
+    last, visited = jax.lax.scan(take, params, rates, length=steps)
     return visited if path else last
 
 
@@ -156,7 +168,8 @@ def _for_every_tensor(name: str, values: Any, params: Any) -> Any:
     try:
         return jax.tree.broadcast(values, params)
     except ValueError as error:
-        raise ValueError(f"{name}: got {jax.tree.structure(values)}, expected {jax.tree.structure(params)}") from error
+        expected = "one value, or the structure of the parameters or its beginning"
+        raise ValueError(f"{name}: got {jax.tree.structure(values)}, expected {expected}: {error}") from error
 
 
 def _mask(mask: Any, params: Any) -> Any:

@@ -43,14 +43,35 @@ def test_the_meta_gradient_is_the_mean_of_the_tasks_however_many_are_worked_on_a
         np.testing.assert_allclose(found[name], np.mean([grad[name] for _, grad in each], axis=0), rtol=1e-12)
 
 
-def test_no_task_at_once_is_refused():
-    with pytest.raises(ValueError, match="at_once: got 0, expected at least 1, or None"):
-        meta.meta_gradient(task_loss, START, (SUPPORT, QUERY), 0)
+def test_few_tasks_at_once_are_added_up_in_single_precision_at_least():
+    """A sum in bfloat16 would stop growing at 256."""
+    found, _ = meta.meta_gradient(lambda p, x: (p * x).astype(float), jnp.bfloat16(1), jnp.ones(1024, jnp.bfloat16), 1)
+    assert found.dtype == jnp.bfloat16
+    assert found == 1
 
 
-@pytest.mark.parametrize(("progress", "weights"), [(0, [1 / 3, 1 / 3, 1 / 3]), (1, [0, 0, 1]), (0.4, [0.2, 0.2, 0.6])])
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((task_loss, START, (SUPPORT, QUERY), 0), "at_once: got 0, expected at least 1, or None"),
+        ((task_loss, START, (SUPPORT, QUERY[:3])), r"tasks: got the leading axes \[\(3,\), \(6,\)\], expected one of"),
+        ((task_loss, START, (SUPPORT[:0], QUERY[:0])), r"tasks: got the leading axes \[\(0,\)\], expected one of"),
+        (
+            (lambda p, t: flat(p), START, (SUPPORT, QUERY)),
+            r"task_loss: got what has the shape \(4,\), expected a scalar",
+        ),
+    ],
+)
+def test_tasks_that_do_not_fit_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        meta.meta_gradient(*arguments)
+
+
+@pytest.mark.parametrize(
+    ("progress", "weights"), [(0, [1 / 3, 1 / 3, 1 / 3]), (1, [0, 0, 1]), (0.4, [0.2, 0.2, 0.6]), (0.4, [1])]
+)
 def test_the_weights_of_steps_move_to_the_last(progress, weights):
-    losses = jnp.asarray(RNG.normal(size=3))
+    losses = jnp.asarray(RNG.normal(size=len(weights)))
     np.testing.assert_allclose(meta.multi_step_loss(losses, progress), losses @ np.array(weights), rtol=1e-12)
 
 
@@ -91,6 +112,30 @@ def test_implicit_and_unrolled_derivatives_agree_where_steps_converge():
     )
 
 
-def test_a_strength_that_holds_nothing_is_refused():
-    with pytest.raises(ValueError, match="strength: got 0, expected more than 0"):
-        meta.implicit_adapt(bowl, START, SUPPORT[0], steps=1, rate=0.1, strength=0)
+def test_tasks_are_adapted_implicitly_side_by_side_in_types_of_their_own():
+    """Of two types, with rates of every tensor, and in single precision within its rounding."""
+
+    def implicit(theta, task):
+        rates = {"a": 0.2, "b": 0.1}
+        found = meta.implicit_adapt(bowl, theta, task[0], steps=200, rate=rates, strength=0.7)
+        return bowl(found, task[1])
+
+    exact, _ = meta.meta_gradient(implicit, START, (SUPPORT, QUERY))
+    mixed = {"a": jnp.asarray(START["a"], jnp.float32), "b": jnp.asarray(START["b"])}
+    found, _ = meta.meta_gradient(implicit, mixed, (SUPPORT, QUERY), 2)
+    for name in START:
+        assert found[name].dtype == mixed[name].dtype
+        np.testing.assert_allclose(found[name], exact[name], rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"strength": 0}, "strength: got 0, expected more than 0"),
+        ({"strength": np.nan}, "strength: got nan, expected more than 0"),
+        ({"strength": 1.0, "iterations": 0}, "iterations: got 0, expected at least 1"),
+    ],
+)
+def test_settings_of_implicit_adaptation_that_do_not_fit_are_refused(settings, message):
+    with pytest.raises(ValueError, match=message):
+        meta.implicit_adapt(bowl, START, SUPPORT[0], steps=1, rate=0.1, **settings)

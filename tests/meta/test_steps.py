@@ -145,12 +145,43 @@ def _is_variable(value):
     return isinstance(value, nnx.Variable)
 
 
-def test_steps_keep_the_types_of_parameters():
-    half = jnp.asarray(START, jnp.bfloat16)
-    for steps in (1, 2):
-        found = meta.adapt(lambda theta: jnp.sum(theta**2), half, steps=steps, rate=0.25)
-        assert found.dtype == jnp.bfloat16
-        np.testing.assert_allclose(np.asarray(found, float), 0.5**steps * np.asarray(half, float), rtol=1e-2)
+@pytest.mark.parametrize("steps", [0, 1, 2])
+def test_steps_keep_the_types_of_parameters(steps):
+    params = {"half": jnp.asarray(START, jnp.bfloat16), "single": np.float32(START), "double": 1.5}
+    square = lambda params: sum(jnp.sum(x.astype(float) ** 2) for x in jax.tree.leaves(params))  # noqa: E731
+    found = meta.adapt(square, params, steps=steps, rate=jnp.float32(0.25))
+    for name, dtype in (("half", jnp.bfloat16), ("single", np.float32), ("double", np.float64)):
+        assert found[name].dtype == dtype
+        np.testing.assert_allclose(
+            np.asarray(found[name], float), 0.5**steps * np.asarray(params[name], float), rtol=2e-2
+        )
+
+
+@pytest.mark.parametrize("steps", [0, 1, 2])
+def test_a_path_has_the_parameters_after_every_step(steps):
+    found = meta.adapt(bowl, START, CENTER, steps=steps, rate=RATE, path=True)
+    each = [meta.adapt(bowl, START, CENTER, steps=k, rate=RATE) for k in range(1, steps + 1)]
+    np.testing.assert_allclose(found, np.reshape(each, (steps, 4)), rtol=1e-12)
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_only_reverse_over_reverse_differentiates_by_data(order):
+    adapted = lambda center: meta.adapt(bowl, START, center, steps=1, rate=RATE, order=order).sum()  # noqa: E731
+    expected = RATE * MATRIX.sum(axis=0) if order == "reverse_over_reverse" else np.zeros(4)
+    np.testing.assert_allclose(jax.grad(adapted)(CENTER), expected, rtol=1e-12)
+
+
+def test_forward_over_reverse_keeps_nothing_of_the_inner_step():
+    """Adds up what is kept for the backward pass: parameters, data and results, and otherwise activations, too."""
+    params, x, y = network()
+    x, y = (jnp.tile(a[0], (100, 1)) for a in (x, y))
+    kept = {}
+    for order in SECOND:
+        pull = jax.vjp(lambda p, order=order: meta.adapt(curved, p, x, y, steps=1, rate=0.1, order=order), params)[1]
+        kept[order] = sum(leaf.size for leaf in jax.tree.leaves(pull))
+    inputs = sum(leaf.size for leaf in jax.tree.leaves((params, x, y)))
+    assert kept["forward_over_reverse"] <= inputs + 2 * len(jax.tree.leaves(params))
+    assert kept["reverse_over_reverse"] > 2 * inputs
 
 
 @pytest.mark.parametrize(
@@ -159,11 +190,21 @@ def test_steps_keep_the_types_of_parameters():
         ({"steps": -1, "rate": 0.1}, "steps: got -1, expected at least 0"),
         ({"steps": 2, "rate": np.ones(3)}, r"rate: got the shape \(3,\), expected a scalar or 2 steps"),
         ({"steps": 1, "rate": 0.1, "order": "second"}, "order: got 'second', expected one of forward_over_reverse, "),
-        ({"steps": 1, "rate": {"first": 0.1}}, r"rate: got PyTreeDef\(\{'first': \*\}\), expected PyTreeDef"),
+        (
+            {"steps": 1, "rate": {"first": 0.1}},
+            r"rate: got PyTreeDef\(\{'first': \*\}\), expected one value, or the structure",
+        ),
         ({"steps": 1, "rate": 0.1, "mask": {"first": 1, "last": True}}, "mask: got 1, expected True or False"),
+        ({"steps": 1, "rate": 0.1, "mask": [True]}, r"mask: got PyTreeDef\(\[\*\]\), expected one value"),
+        ({"steps": 1, "rate": 0.1, "clip": -1.0}, "clip: got -1.0, expected at least 0, or None"),
     ],
 )
 def test_settings_that_do_not_fit_are_refused(settings, message):
     params, x, y = network()
     with pytest.raises(ValueError, match=message):
         meta.adapt(curved, params, x[0], y[0], **settings)
+
+
+def test_a_rate_of_one_step_is_a_scalar():
+    with pytest.raises(ValueError, match=r"rate: got the shape \(4,\), expected a scalar"):
+        meta.inner_step(bowl, START, CENTER, rate=np.ones(4))
