@@ -7,13 +7,6 @@ import pytest
 
 from milx import meta
 
-
-@pytest.fixture(autouse=True, scope="module")
-def float64():
-    with jax.enable_x64(True):
-        yield
-
-
 RNG = np.random.default_rng(2)
 ROOT = RNG.normal(size=(4, 4))
 MATRIX = ROOT @ ROOT.T / 4 + np.eye(4)

@@ -13,12 +13,6 @@ from milx.meta import ORDERS
 SECOND = ORDERS[:2]
 
 
-@pytest.fixture(autouse=True, scope="module")
-def float64():
-    with jax.enable_x64(True):
-        yield
-
-
 RNG = np.random.default_rng(0)
 ROOT = RNG.normal(size=(4, 4))
 MATRIX = ROOT @ ROOT.T / 4 + np.eye(4)
