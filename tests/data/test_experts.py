@@ -115,10 +115,13 @@ def test_plans_are_found_once_and_kept(env, tmp_path, monkeypatch, capsys):
 @pytest.mark.slow
 @pytest.mark.parametrize(("expert", "iterations"), [("sampling", 4), ("receding", 1)])
 def test_place_is_demonstrated_by_sampling(env, monkeypatch, expert, iterations):
-    """The preset's noise; iLQR succeeds in 99% of the demonstrations, and a random container in a third."""
+    """Uses the preset's noise.
+
+    94% of 192 such demonstrations succeed with a receding horizon, and a random container in a third.
+    """
     monkeypatch.setattr(experts, "SETTINGS", FEW)
     settings = {"expert": expert, "plan_iterations": iterations, "plan_batch": 24}
     config = dataclasses.replace(make_config("place", preset="fast").data, **settings)
     demos = collect(env, jax.random.key(3), "validation", 12, 2, config)
-    assert float(demos.success.mean()) >= 0.8
+    assert float(demos.success.mean()) >= 0.7  # of 24; 94% would give less in one of 19,000 sets
     assert experts.description(env, config) != experts.description(env, dataclasses.replace(config, expert="ilqr"))
