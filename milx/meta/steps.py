@@ -24,7 +24,7 @@ a value that JAX traces: what belongs to a task is passed as data."""
 ORDERS = ("forward_over_reverse", "reverse_over_reverse", "first_order")
 """How the derivative of an inner gradient is taken: its product of the Hessian with a vector forward over reverse or
 reverse over reverse, which give the same by the parameters, or not at all. Only reverse over reverse differentiates by
-the data, too; to the others they are constants, so what is meta-learned belongs into the parameters."""
+the data, too; to the others they are constants, so what is meta-learned belongs in the parameters."""
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
