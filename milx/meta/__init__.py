@@ -10,14 +10,13 @@ through these steps (MAML, Finn et al. 2017):
     gradient, losses = meta.meta_gradient(task_loss, params, tasks)
 """
 
-from milx.meta.convolution import Conv, conv2d
+from milx.meta.convolution import conv2d
 from milx.meta.implicit import implicit_adapt
 from milx.meta.objective import meta_gradient, multi_step_loss
 from milx.meta.steps import ORDERS, adapt, gradient, inner_step
 
 __all__ = [
     "ORDERS",
-    "Conv",
     "adapt",
     "conv2d",
     "gradient",

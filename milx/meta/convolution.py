@@ -6,31 +6,8 @@ which XLA runs badly everywhere. Written as one matrix product, the same convolu
 
 import functools
 
-import flax.linen as nn
 import jax
 import jax.numpy as jnp
-
-
-class Conv(nn.Module):
-    """`flax.linen.Conv` with a square kernel, SAME padding and a bias, computed by `conv2d`; its parameters fit.
-
-    Attributes:
-        features: F, output channels.
-        kernel: k, kernel height and width.
-        stride: the same in both directions.
-    """
-
-    features: int
-    kernel: int
-    stride: int = 1
-
-    @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
-        """Maps [B, H, W, C] to [B, ceil(H / stride), ceil(W / stride), F]."""
-        shape = (self.kernel, self.kernel, x.shape[-1], self.features)
-        kernel = self.param("kernel", nn.initializers.lecun_normal(), shape)
-        bias = self.param("bias", nn.initializers.zeros, (self.features,))
-        return conv2d(x, kernel, self.stride) + bias
 
 
 def same_padding(size: int, kernel: int, stride: int) -> tuple[int, int]:

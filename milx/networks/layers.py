@@ -100,6 +100,28 @@ def _sum_over_pixels(x: jax.Array, dtype: jnp.dtype) -> jax.Array:
     return jnp.matmul(ones, flat, precision=jax.lax.Precision.HIGHEST, preferred_element_type=dtype)[0]
 
 
+class Conv(nn.Module):
+    """`flax.linen.Conv` with a square kernel, SAME padding and a bias, computed by `conv2d`; its parameters fit.
+
+    Attributes:
+        features: F, output channels.
+        kernel: k, kernel height and width.
+        stride: the same in both directions.
+    """
+
+    features: int
+    kernel: int
+    stride: int = 1
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        """Maps [B, H, W, C] to [B, ceil(H / stride), ceil(W / stride), F]."""
+        shape = (self.kernel, self.kernel, x.shape[-1], self.features)
+        kernel = self.param("kernel", nn.initializers.lecun_normal(), shape)
+        bias = self.param("bias", nn.initializers.zeros, (self.features,))
+        return conv2d(x, kernel, self.stride) + bias
+
+
 class ConvBlock(nn.Module):
     """Convolution, bias, layer norm over (H, W, C), ReLU; before the ReLU something may be added (He et al. 2016).
 

@@ -1,14 +1,13 @@
-"""Convolutions against `jax.lax` and flax."""
+"""Convolutions against `jax.lax`."""
 
 import functools
 
-import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from milx.meta import Conv, convolution
+from milx.meta import convolution
 
 
 def reference_conv2d(x, kernel, stride):
@@ -71,13 +70,3 @@ def test_convolution_with_every_tasks_own_kernel_is_a_loop_of_lax(rng, convolve)
     found = jax.vmap(lambda x, kernel: convolve(x, kernel, 2))(x, kernel)
     expected = [reference_conv2d(x[i], kernel[i], 2) for i in range(5)]
     np.testing.assert_allclose(found, expected, atol=1e-12)
-
-
-@pytest.mark.parametrize("stride", [1, 2])
-def test_the_layer_is_that_of_flax(rng, stride):
-    x = rng.standard_normal((2, 9, 12, 3))
-    theirs, ours = nn.Conv(5, (3, 3), stride), Conv(5, 3, stride)
-    params = theirs.init(jax.random.key(0), x)
-    params["params"]["bias"] = jnp.asarray(rng.standard_normal(5))
-    np.testing.assert_allclose(ours.apply(params, x), theirs.apply(params, x), atol=1e-6)
-    jax.tree.map(lambda a, b: np.testing.assert_array_equal(a.shape, b.shape), ours.init(jax.random.key(0), x), params)

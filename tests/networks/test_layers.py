@@ -1,5 +1,6 @@
 """Layers against `jax.lax`, closed forms and their laws."""
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +9,19 @@ import pytest
 from milx.config.schema import ConvConfig
 from milx.networks import layers
 from milx.networks.policy_network import ConvStack
+
+# Convolution.
+
+
+@pytest.mark.parametrize("stride", [1, 2])
+def test_the_layer_is_that_of_flax(rng, stride):
+    x = rng.standard_normal((2, 9, 12, 3))
+    theirs, ours = nn.Conv(5, (3, 3), stride), layers.Conv(5, 3, stride)
+    params = theirs.init(jax.random.key(0), x)
+    params["params"]["bias"] = jnp.asarray(rng.standard_normal(5))
+    np.testing.assert_allclose(ours.apply(params, x), theirs.apply(params, x), atol=1e-6)
+    jax.tree.map(lambda a, b: np.testing.assert_array_equal(a.shape, b.shape), ours.init(jax.random.key(0), x), params)
+
 
 # Spatial soft-argmax.
 
