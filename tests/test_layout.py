@@ -9,8 +9,8 @@ import pytest
 
 ROOT = pathlib.Path(__file__).parents[1]
 FLOORS = (
-    {"types", "core", "meta"},
-    {"config", "render"},
+    {"types", "core"},
+    {"config", "render", "meta"},
     {"networks", "envs"},
     {"methods", "trajopt"},
     {"data"},

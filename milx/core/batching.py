@@ -53,24 +53,35 @@ def _join(results: list[Any], total: int) -> Any:
     return jax.tree.map(lambda *xs: jnp.concatenate(xs)[:total], *results)
 
 
+def in_groups(inputs: Any, most: int) -> Any:
+    """Reshapes a pytree with a leading axis [N] to equal groups, [N / size, size, ...].
+
+    Args:
+        inputs: what is grouped.
+        most: maximum size of a group. The size is the largest divisor of N that is at most `most`, so the groups have
+            size 1 if N is a prime number greater than `most`.
+    """
+    total = len(jax.tree.leaves(inputs)[0])
+    size = max(size for size in range(1, total + 1) if total % size == 0 and size <= max(most, 1))
+    # All sizes are explicit, because they cannot be inferred for arrays without entries.
+    return jax.tree.map(lambda x: jnp.reshape(x, (total // size, size, *jnp.shape(x)[1:])), inputs)
+
+
 def map_in_groups(function: Callable[..., Any], inputs: tuple, most: int) -> Any:
-    """Computes `jax.vmap(function)(*inputs)` in equal groups, one after the other, inside `jax.jit`.
+    """Computes `jax.vmap(function)(*inputs)` in the groups of `in_groups`, one after the other, inside `jax.jit`.
 
     Args:
         function: maps pytrees to a pytree.
         inputs: the function's inputs, with a leading axis [N].
-        most: maximum size of a group. The size is the largest divisor of N that is at most `most`, so the groups have
-            size 1 if N is a prime number greater than `most`.
+        most: maximum size of a group.
 
     Returns:
         The results, with leading axis [N].
     """
-    total = len(jax.tree.leaves(inputs)[0])
-    size = max(size for size in range(1, total + 1) if total % size == 0 and size <= max(most, 1))
-    if size == total:
+    groups = in_groups(inputs, most)
+    count, size = jax.tree.leaves(groups)[0].shape[:2]
+    if count == 1:
         return jax.vmap(function)(*inputs)
-    # All sizes are explicit, because they cannot be inferred for arrays without entries: jax.lax.map(batch_size=...)
-    # fails on such arrays.
-    groups = jax.tree.map(lambda x: x.reshape(total // size, size, *x.shape[1:]), inputs)
+    # Not by jax.lax.map(batch_size=...), which fails on arrays without entries.
     found = jax.lax.map(lambda group: jax.vmap(function)(*group), groups)
-    return jax.tree.map(lambda x: x.reshape(total, *x.shape[2:]), found)
+    return jax.tree.map(lambda x: x.reshape(count * size, *x.shape[2:]), found)

@@ -6,6 +6,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from milx.core.batching import in_groups
+
 
 def multi_step_loss(losses: jax.Array, progress: jax.Array | float) -> jax.Array:
     """Weighs the losses [K] after each of K inner steps: sum over k of w_k L_k (Antoniou et al. 2019, Section 4).
@@ -52,17 +54,15 @@ def meta_gradient(
 
         return jax.grad(mean_loss, has_aux=True)(params)
 
-    size = max(size for size in range(1, count + 1) if count % size == 0 and size <= (at_once or count))
-    if size == count:
+    if at_once is None or at_once >= count:
         return of_group(tasks)
 
     def add(total: Any, group: Any) -> tuple[Any, jax.Array]:
         gradient, losses = of_group(group)
         return jax.tree.map(lambda total, x: total + x.astype(total.dtype), total, gradient), losses
 
-    groups = jax.tree.map(lambda x: jnp.reshape(x, (count // size, size, *jnp.shape(x)[1:])), tasks)
     params = jax.tree.map(jnp.asarray, params)
     zeros = jax.tree.map(lambda p: jnp.zeros(p.shape, jnp.promote_types(p.dtype, jnp.float32)), params)
-    total, losses = jax.lax.scan(add, zeros, groups)
-    mean = jax.tree.map(lambda x, p: (x / (count // size)).astype(p.dtype), total, params)
+    total, losses = jax.lax.scan(add, zeros, in_groups(tasks, at_once))
+    mean = jax.tree.map(lambda x, p: (x / len(losses)).astype(p.dtype), total, params)
     return mean, losses.reshape(count)
