@@ -1,8 +1,10 @@
 """The planner by sampling on a cart, whose world is a few lines: what it begins with, executes and records."""
 
 import dataclasses
+import functools
 import types
 
+import cart_laws
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -150,15 +152,8 @@ def test_plans_are_shared_until_enough_scenes_have_one(cart, plans, monkeypatch,
 
 
 def test_what_is_executed_is_what_was_recorded_and_noise(cart, scenes, plans):
-    """Infers what drove the cart from its velocities: without noise the action, and otherwise what spreads so."""
-    task, start, keys = scenes
-    for noise in (0.0, NOISE):
-        states, actions = planner.demonstrate(cart, SETTINGS, plans, noise, task, start, keys)
-        driven = np.diff(states.qvel[..., 0], axis=1) / 0.25
-        off = (driven - actions[..., 0])[np.abs(driven) < 0.99]
-        assert off.size > 300
-        # Three standard errors of a standard deviation.
-        np.testing.assert_allclose(np.sqrt((off**2).mean()), noise, rtol=3 / np.sqrt(2 * off.size), atol=1e-5)
+    demonstrate = functools.partial(planner.demonstrate, cart, SETTINGS, plans)
+    cart_laws.check_that_noise_alone_is_not_recorded(demonstrate, scenes, NOISE)
 
 
 def test_a_plan_that_is_kept_is_tracked_in_the_world(cart, scenes):
@@ -184,17 +179,8 @@ def test_a_plan_that_is_kept_is_tracked_in_the_world(cart, scenes):
 
 
 def test_only_noise_tells_two_demonstrations_of_a_scene_apart(cart, scenes, plans):
-    task, start = jax.tree.map(lambda x: jnp.repeat(x[:1], len(x), axis=0), scenes[:2])
-    _, alike = planner.demonstrate(cart, SETTINGS, plans, 0.0, task, start, scenes[2])
-    np.testing.assert_allclose(alike, jnp.repeat(alike[:1], len(alike), axis=0), atol=1e-6)
-    states, actions = planner.demonstrate(cart, SETTINGS, plans, NOISE, task, start, scenes[2])
-    driven = np.diff(states.qvel[..., 0], axis=1) / 0.25
-    drawn = np.where(np.abs(driven) < 0.99, driven - actions[..., 0], np.nan)
-    apart, count = drawn - np.nanmean(drawn, axis=0), np.isfinite(drawn).sum()
-    assert count > 300
-    np.testing.assert_allclose(np.sqrt(np.nanmean(apart**2)), NOISE, rtol=3 / np.sqrt(2 * count))
-    neighbors = apart[:, 1:] * apart[:, :-1] / NOISE**2
-    assert abs(np.nanmean(neighbors)) < 3 / np.sqrt(np.isfinite(neighbors).sum()), "every step draws its own"
+    demonstrate = functools.partial(planner.demonstrate, cart, SETTINGS, plans)
+    cart_laws.check_that_noise_alone_tells_demonstrations_of_a_scene_apart(demonstrate, scenes, NOISE)
 
 
 def test_what_is_sampled_is_what_its_version_says(cart, scenes, plans):
