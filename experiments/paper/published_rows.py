@@ -234,12 +234,12 @@ _SAMPLING = {
 _LADDER = _ladder()
 _SAMPLED = _LADDER["push-fast"].changes | _SAMPLING
 _EXPERTS = {
-    "push-sampling": Row("push: `fast`, by sampling", "push", _SAMPLED),
     "push-sampling-beginning": Row(
         "push: `fast`, by sampling, more of the beginning",
         "push",
         _SAMPLED | {"train.frame_exponent": 2.0},
     ),
+    "push-sampling": Row("push: `fast`, by sampling", "push", _SAMPLED),
 }
 
 TABLES: dict[str, dict[str, Row]] = {
