@@ -180,7 +180,7 @@ def hosts(data, tmp_path_factory):
         free.bind(("localhost", 0))
         address = f"localhost:{free.getsockname()[1]}"
     both = [start(1, "host", i, address, data, folder / "run") for i in range(2)]
-    return [answer(process) for process in both]
+    return [answer(process) | {"folder": folder / "run"} for process in both]
 
 
 @pytest.fixture(scope="module")
@@ -205,6 +205,13 @@ def test_demonstrations_and_trials_do_not_depend_on_the_number_of_devices(device
 def test_a_checkpoint_of_one_device_is_restored_on_four(alone, devices):
     assert len(set(alone["params"])) > 300
     assert devices["restored"] == alone["params"]
+
+
+def test_a_checkpoint_of_two_hosts_is_restored_on_one_device(hosts):
+    assert params_of(hosts[0]["folder"]) == hosts[0]["params"]
+    for path in (hosts[0]["folder"] / "checkpoints").glob("*/checksums.json"):
+        path.unlink()  # then every array is read before it is trusted
+    assert params_of(hosts[0]["folder"]) == hosts[0]["params"]
 
 
 def test_two_hosts_have_the_losses_of_one_device(devices, hosts):

@@ -103,9 +103,11 @@ class Checkpoints:
         Raises:
             FileError: if the checkpoint does not hold these items.
         """
-        restores = {name: ocp.args.StandardRestore(jax.tree.map(_stored, tree)) for name, tree in like.items()}
+        restores = {name: ocp.args.StandardRestore(jax.tree.map(_on_host, tree)) for name, tree in like.items()}
         try:
             restored = self._manager.restore(step, args=ocp.args.Composite(**restores, extra=ocp.args.JsonRestore()))
+            for name, tree in like.items():
+                jax.tree.map(_check_shape, tree, restored[name])
         except Exception as error:  # Orbax and TensorStore raise many types of errors
             reason = f"{type(error).__name__}: {str(error).strip().splitlines()[0]}"
             expected = f"what this version of milx writes; it is of {self._origin(step)}"
@@ -266,6 +268,17 @@ def _stored(x: Any) -> Any:
     return x if np.size(x) else np.zeros(1, x.dtype)
 
 
+def _on_host(x: Any) -> np.ndarray:
+    """Asks for an array on the host: Orbax would look for the devices that it was saved from, which may be others."""
+    return np.zeros(x.shape if np.size(x) else 1, x.dtype)
+
+
+def _check_shape(like: Any, x: np.ndarray) -> None:
+    """Raises ValueError if an array was stored with another shape, which Orbax does not check on the host."""
+    if np.size(like) and like.shape != x.shape:
+        raise ValueError(f"its shape is {x.shape}, not {like.shape}")
+
+
 def _damage(checkpoint: pathlib.Path) -> str | None:
     """Describes what is wrong with a checkpoint's files; returns None if they are undamaged.
 
@@ -311,7 +324,7 @@ def _unreadable(checkpoint: pathlib.Path) -> str | None:
     with contextlib.closing(ocp.StandardCheckpointer()) as reader:
         for item in sorted(path.parent for path in checkpoint.glob("*/manifest.ocdbt")):
             try:
-                reader.restore(item)
+                reader.restore(item, jax.tree.map(_on_host, reader.metadata(item).item_metadata.tree))
             except Exception as error:  # Orbax and TensorStore raise many types of errors
                 return f"{item.name} cannot be read ({type(error).__name__})"
     return None
