@@ -84,7 +84,7 @@ def by_milx(params: Params, tasks: tuple[jax.Array, ...], steps: int) -> Params:
         adapted = meta.adapt(inner, params, *task[:2], steps=steps, rate=RATE)
         return inner(adapted, *task[2:])
 
-    return meta.meta_gradient(task_loss, params, tasks)[0]
+    return meta.meta_gradient(task_loss, params, tasks, at_once=None if common.accelerated() else 1)[0]
 
 
 def lax_convolution(x: jax.Array, kernel: jax.Array, stride: int) -> jax.Array:

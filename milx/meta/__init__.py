@@ -12,7 +12,7 @@ through these steps (MAML, Finn et al. 2017):
 
 from milx.meta.convolution import conv2d
 from milx.meta.implicit import implicit_adapt
-from milx.meta.objective import meta_gradient, multi_step_loss
+from milx.meta.objective import meta_gradient, multi_step_loss, tasks_within
 from milx.meta.steps import ORDERS, adapt, gradient, inner_step
 
 __all__ = [
@@ -24,4 +24,5 @@ __all__ = [
     "inner_step",
     "meta_gradient",
     "multi_step_loss",
+    "tasks_within",
 ]

@@ -1,5 +1,7 @@
 """What is minimized over tasks, and its gradient within a bound on memory."""
 
+import bisect
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -29,7 +31,8 @@ def meta_gradient(
         params: what it is differentiated by.
         tasks: N of them, a pytree whose leaves have this leading axis.
         at_once: how many tasks are worked on at the same time, at most, which bounds memory; None for all. The number
-            is the largest divisor of N that is not larger.
+            is the largest divisor of N that is not larger. `tasks_within` finds one for a bound in bytes; on a CPU one
+            task at a time is often fastest, too, where a task has many images.
 
     Returns:
         The gradient, as `params`, and the losses [N].
@@ -38,9 +41,7 @@ def meta_gradient(
         ValueError: if there is no task, or the leaves have several leading axes; if no task is to be worked on at once;
             if a task's loss is no scalar.
     """
-    shapes = {jnp.shape(leaf)[:1] for leaf in jax.tree.leaves(tasks)}
-    if len(shapes) != 1 or not (count := sum(next(iter(shapes)))):
-        raise ValueError(f"tasks: got the leading axes {sorted(shapes)}, expected one of at least 1")
+    count = _count(tasks)
     if at_once is not None and at_once < 1:
         raise ValueError(f"at_once: got {at_once}, expected at least 1, or None")
 
@@ -66,3 +67,43 @@ def meta_gradient(
     total, losses = jax.lax.scan(add, zeros, in_groups(tasks, at_once))
     mean = jax.tree.map(lambda x, p: (x / len(losses)).astype(p.dtype), total, params)
     return mean, losses.reshape(count)
+
+
+def tasks_within(memory: int, task_loss: Callable[[Any, Any], jax.Array], params: Any, tasks: Any) -> int:
+    """Finds how many tasks `meta_gradient` may work on at the same time within a bound on memory.
+
+    Programs are compiled for shapes alone, each for another number of tasks, until the largest is found that fits.
+
+    Args:
+        memory: bytes for what a program needs beside its arguments and its results.
+        task_loss: as in `meta_gradient`.
+        params: arrays, or their shapes (`jax.ShapeDtypeStruct`).
+        tasks: N of them, or their shapes.
+
+    Returns:
+        `at_once` for `meta_gradient`, a divisor of N.
+
+    Raises:
+        ValueError: if one task at a time needs more; the message says how much. As `meta_gradient`.
+    """
+    count, shapes = _count(tasks), jax.eval_shape(lambda *x: x, params, tasks)
+
+    @functools.cache
+    def needed(at_once: int) -> int:
+        gradient = jax.jit(functools.partial(meta_gradient, task_loss, at_once=at_once))
+        analysis = gradient.lower(*shapes).compile().memory_analysis()
+        assert analysis is not None, "CPUs and GPUs tell"
+        return analysis.temp_size_in_bytes
+
+    divisors = [number for number in range(1, count + 1) if count % number == 0]
+    fitting = bisect.bisect_right(divisors, memory, key=needed)
+    if not fitting:
+        raise ValueError(f"memory: got {memory:,} bytes, expected at least the {needed(1):,} that one task needs")
+    return divisors[fitting - 1]
+
+
+def _count(tasks: Any) -> int:
+    shapes = {jnp.shape(leaf)[:1] for leaf in jax.tree.leaves(tasks)}
+    if len(shapes) != 1 or not (count := sum(next(iter(shapes)))):
+        raise ValueError(f"tasks: got the leading axes {sorted(shapes)}, expected one of at least 1")
+    return count

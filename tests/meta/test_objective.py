@@ -132,3 +132,22 @@ def test_tasks_are_adapted_implicitly_side_by_side_in_types_of_their_own():
 def test_settings_of_implicit_adaptation_that_do_not_fit_are_refused(settings, message):
     with pytest.raises(ValueError, match=message):
         meta.implicit_adapt(bowl, START, SUPPORT[0], steps=1, rate=0.1, **settings)
+
+
+def wide(w, x):
+    """Needs much memory for every task."""
+    return jnp.square(jnp.tanh(jnp.tanh(x[:, None] * w) @ w)).sum()
+
+
+def test_as_many_tasks_are_worked_on_at_once_as_memory_allows():
+    shapes = jax.ShapeDtypeStruct((50,), float), jax.ShapeDtypeStruct((12, 400), float)
+    needed = {}
+    for at_once in (1, 2, 3, 4, 6, 12):
+        lowered = jax.jit(lambda w, x, n=at_once: meta.meta_gradient(wide, w, x, n)).lower(*shapes)
+        needed[at_once] = lowered.compile().memory_analysis().temp_size_in_bytes
+    assert sorted(needed.values()) == list(needed.values()), "more tasks need more"
+    for memory in (*needed.values(), needed[4] + 1, needed[12] * 2):
+        most = max(n for n, least in needed.items() if least <= memory)
+        assert meta.tasks_within(memory, wide, *shapes) == most
+    with pytest.raises(ValueError, match=rf"memory: got {needed[1] - 1:,} bytes, expected at least the {needed[1]:,} "):
+        meta.tasks_within(needed[1] - 1, wide, *shapes)
