@@ -59,7 +59,7 @@ def printed(notebook):
 
 def test_notebooks_are_stored_as_they_ran_from_top_to_bottom():
     paths = sorted(NOTEBOOKS.glob("*.ipynb"))
-    assert len(paths) == 3
+    assert len(paths) == 4
     for path in paths:
         assert not re.search(r"/(work|root|home|Users)/|/tmp/tmp", path.read_text()), path
         cells = code(nbformat.read(path, as_version=4))
@@ -129,3 +129,15 @@ def test_demonstrations_of_ones_own_are_learned_from(execute):
     assert errors["other_task"] > errors["mean_action"]
     assert "'adapt.bin'" in text
     assert re.search(r"exported policy: \[", text)
+
+
+@pytest.mark.slow
+def test_curves_and_characters_are_meta_learned(execute):
+    text = printed(execute("meta_learn_anything", steps=60, tasks=24))
+    before, after = map(float, re.search(r"meta-learned: error ([\d.]+), after one step ([\d.]+)", text).groups())
+    average = float(re.search(r"average: error [\d.]+, after one step ([\d.]+)", text).group(1))
+    assert after < 0.8 * before
+    assert after < average
+    found = re.search(r"5-way, 1-shot: ([\d.]+)% after one step, ([\d.]+)% before", text)
+    assert float(found.group(1)) > 50, "guessing has 20%, and so have parameters before the step"
+    assert float(found.group(2)) < 35
