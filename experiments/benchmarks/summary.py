@@ -10,7 +10,7 @@ import sys
 import matplotlib.pyplot as plt
 from matplotlib.ticker import NullFormatter
 
-PEERS = ("PyTorch", "JAX, vmap", "MJX", "mujoco", "mapped jvp", "hydrax")
+PEERS = ("PyTorch", "JAX, vmap", "MJX", "mujoco", "mapped jvp", "hydrax", "jaxopt", "higher", "TorchOpt", "learn2learn")
 FOLDER = pathlib.Path(__file__).parents[1] / "results" / "benchmarks"
 
 
@@ -30,23 +30,38 @@ def table(results: list[dict]) -> str:
     return "\n".join(lines)
 
 
-def draw(results: list[dict], path: pathlib.Path) -> None:
-    """Draws one panel of bars for every file, without shares and what was not run; peers are gray."""
-    figure, axes = plt.subplots(len(results), 1, figsize=(9, 2.2 * len(results)), squeeze=False, layout="constrained")
-    for axis, result in zip(axes[:, 0], results, strict=True):
+def panels(results: list[dict]) -> list[tuple[str, list[dict]]]:
+    """Selects the rows of every panel, with its title: those of one file and one unit, without what was not run."""
+    found = []
+    for result in results:
         rows = [row for row in result["rows"] if row["median"] is not None and not row["unit"].startswith("%")]
-        labels = [f"{row['name']} ({row['unit']})" for row in rows]
+        for unit in dict.fromkeys(row["unit"] for row in rows):
+            title = ", ".join(filter(None, (result["benchmark"], unit, result["hardware"])))
+            found.append((title, [row for row in rows if row["unit"] == unit]))
+    return found
+
+
+def draw(results: list[dict], path: pathlib.Path) -> None:
+    """Draws the panels as bars, one below the other, each as high as it has rows; peers are gray."""
+    drawn = panels(results)
+    heights = [0.5 + 0.16 * len(rows) for _, rows in drawn]
+    figure, axes = plt.subplots(
+        len(drawn), 1, figsize=(9, sum(heights)), height_ratios=heights, squeeze=False, layout="constrained"
+    )
+    for axis, (title, rows) in zip(axes[:, 0], drawn, strict=True):
         medians = [row["median"] for row in rows]
         peers = [any(peer in row["name"] for peer in PEERS) for row in rows]
+        labels = [row["name"] for row in rows]
         bars = axis.barh(labels, medians, color=["0.7" if peer else "tab:blue" for peer in peers])
-        axis.bar_label(bars, [f" {median:,.3g}" for median in medians], fontsize=6)
+        axis.bar_label(
+            bars, [f" {median:,.0f}" if median >= 100 else f" {median:.3g}" for median in medians], fontsize=6
+        )
         axis.set(xscale="log", xlim=(min(medians) / 3, max(medians) * 3))
-        axis.set_title(f"{result['benchmark']}, {result['hardware']}")
+        axis.set_title(title, fontsize=8)
         axis.invert_yaxis()
         axis.xaxis.set_minor_formatter(NullFormatter())
         axis.tick_params(labelsize=6)
-        axis.title.set_fontsize(8)
-    figure.savefig(path, dpi=150)
+    figure.savefig(path, dpi=110)
     plt.close(figure)
 
 
