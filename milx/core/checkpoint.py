@@ -5,6 +5,7 @@ to `damaged/` beside the folder of checkpoints. Nothing is lost, and checkpoints
 """
 
 import contextlib
+import functools
 import pathlib
 import shutil
 import tempfile
@@ -106,8 +107,8 @@ class Checkpoints:
         restores = {name: ocp.args.StandardRestore(jax.tree.map(_on_host, tree)) for name, tree in like.items()}
         try:
             restored = self._manager.restore(step, args=ocp.args.Composite(**restores, extra=ocp.args.JsonRestore()))
-            for name, tree in like.items():
-                jax.tree.map(_check_shape, tree, restored[name])
+            for name, tree in restores.items():
+                jax.tree_util.tree_map_with_path(functools.partial(_check_shape, name), tree.item, restored[name])
         except Exception as error:  # Orbax and TensorStore raise many types of errors
             reason = f"{type(error).__name__}: {str(error).strip().splitlines()[0]}"
             expected = f"what this version of milx writes; it is of {self._origin(step)}"
@@ -273,10 +274,10 @@ def _on_host(x: Any) -> np.ndarray:
     return np.zeros(x.shape if np.size(x) else 1, x.dtype)
 
 
-def _check_shape(like: Any, x: np.ndarray) -> None:
+def _check_shape(name: str, path: tuple, wanted: np.ndarray, x: np.ndarray) -> None:
     """Raises ValueError if an array was stored with another shape, which Orbax does not check on the host."""
-    if np.size(like) and like.shape != x.shape:
-        raise ValueError(f"its shape is {x.shape}, not {like.shape}")
+    if wanted.shape != x.shape:
+        raise ValueError(f"{name}{jax.tree_util.keystr(path)}: got the shape {x.shape}, expected {wanted.shape}")
 
 
 def _damage(checkpoint: pathlib.Path) -> str | None:

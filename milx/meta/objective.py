@@ -1,6 +1,5 @@
 """What is minimized over tasks, and its gradient within a bound on memory."""
 
-import bisect
 import functools
 from collections.abc import Callable
 from typing import Any
@@ -31,8 +30,7 @@ def meta_gradient(
         params: what it is differentiated by.
         tasks: N of them, a pytree whose leaves have this leading axis.
         at_once: how many tasks are worked on at the same time, at most, which bounds memory; None for all. The number
-            is the largest divisor of N that is not larger. `tasks_within` finds one for a bound in bytes; on a CPU one
-            task at a time is often fastest, too, where a task has many images.
+            is the largest divisor of N that is not larger. `tasks_within` finds one for a bound in bytes.
 
     Returns:
         The gradient, as `params`, and the losses [N].
@@ -70,12 +68,13 @@ def meta_gradient(
 
 
 def tasks_within(memory: int, task_loss: Callable[[Any, Any], jax.Array], params: Any, tasks: Any) -> int:
-    """Finds how many tasks `meta_gradient` may work on at the same time within a bound on memory.
+    """Finds the largest number of tasks on which `meta_gradient` can work at the same time within a bound on memory.
 
-    Programs are compiled for shapes alone, each for another number of tasks, until the largest is found that fits.
+    Compiles the meta-gradient, from shapes alone, for one number of tasks after the other, from all of them down. The
+    bound holds for a program that does nothing else.
 
     Args:
-        memory: bytes for what a program needs beside its arguments and its results.
+        memory: bytes for what the program needs beside its arguments and its results.
         task_loss: as in `meta_gradient`.
         params: arrays, or their shapes (`jax.ShapeDtypeStruct`).
         tasks: N of them, or their shapes.
@@ -84,25 +83,27 @@ def tasks_within(memory: int, task_loss: Callable[[Any, Any], jax.Array], params
         `at_once` for `meta_gradient`, a divisor of N.
 
     Raises:
-        ValueError: if one task at a time needs more; the message says how much. As `meta_gradient`.
+        ValueError: if no number fits; the message says what one task at a time needs. Also where `meta_gradient` raises
+            one.
     """
     count, shapes = _count(tasks), jax.eval_shape(lambda *x: x, params, tasks)
-
-    @functools.cache
-    def needed(at_once: int) -> int:
+    needed = 0
+    for at_once in (number for number in range(count, 0, -1) if count % number == 0):
         gradient = jax.jit(functools.partial(meta_gradient, task_loss, at_once=at_once))
         analysis = gradient.lower(*shapes).compile().memory_analysis()
         assert analysis is not None, "CPUs and GPUs tell"
-        return analysis.temp_size_in_bytes
-
-    divisors = [number for number in range(1, count + 1) if count % number == 0]
-    fitting = bisect.bisect_right(divisors, memory, key=needed)
-    if not fitting:
-        raise ValueError(f"memory: got {memory:,} bytes, expected at least the {needed(1):,} that one task needs")
-    return divisors[fitting - 1]
+        needed = analysis.temp_size_in_bytes
+        if needed <= memory:
+            return at_once
+    raise ValueError(f"memory: got {memory:,} bytes, expected at least {needed:,}, which one task at a time needs")
 
 
 def _count(tasks: Any) -> int:
+    """Returns how many tasks there are.
+
+    Raises:
+        ValueError: if there is none, or if their leaves have several leading axes.
+    """
     shapes = {jnp.shape(leaf)[:1] for leaf in jax.tree.leaves(tasks)}
     if len(shapes) != 1 or not (count := sum(next(iter(shapes)))):
         raise ValueError(f"tasks: got the leading axes {sorted(shapes)}, expected one of at least 1")

@@ -209,7 +209,8 @@ def test_a_truncated_one_without_checksums_is_passed_over(folder, tmp_path):
 
 def test_other_items_are_refused_with_a_reason(folder):
     checkpoints = Checkpoints(folder, read_only=True)
-    for like in ({"params": {"a": jnp.zeros((3, 4))}}, {"params": {"a": jnp.zeros((9, 9)), "b": jnp.zeros(5)}}):
+    a, b = jnp.zeros((3, 4)), jnp.zeros(5)
+    for like in ({"params": {"a": a}}, *({"params": {"a": x, "b": b}} for x in (jnp.zeros((9, 9)), jnp.zeros((0, 4))))):
         expected = "20: cannot be restored, expected what this version of milx writes; it is of an unknown version"
         with pytest.raises(ValueError, match=expected):
             checkpoints.restore(20, like)

@@ -139,15 +139,27 @@ def wide(w, x):
     return jnp.square(jnp.tanh(jnp.tanh(x[:, None] * w) @ w)).sum()
 
 
-def test_as_many_tasks_are_worked_on_at_once_as_memory_allows():
-    shapes = jax.ShapeDtypeStruct((50,), float), jax.ShapeDtypeStruct((12, 400), float)
+def summed(w, x):
+    """Needs none for all tasks at once, where nothing is added up in a scan."""
+    return jnp.square(w).sum() * x.sum() + (jnp.tanh(w) * x.sum()).sum()
+
+
+@pytest.mark.parametrize(("loss", "sizes"), [(wide, (50, 12, 400)), (summed, (10_000, 4, 3))])
+def test_as_many_tasks_are_worked_on_at_once_as_memory_allows(loss, sizes):
+    w, x = RNG.normal(size=sizes[0]), RNG.normal(size=sizes[1:])
     needed = {}
-    for at_once in (1, 2, 3, 4, 6, 12):
-        lowered = jax.jit(lambda w, x, n=at_once: meta.meta_gradient(wide, w, x, n)).lower(*shapes)
+    for at_once in (n for n in range(1, len(x) + 1) if len(x) % n == 0):
+        lowered = jax.jit(lambda w, x, n=at_once: meta.meta_gradient(loss, w, x, n)).lower(w, x)
         needed[at_once] = lowered.compile().memory_analysis().temp_size_in_bytes
-    assert sorted(needed.values()) == list(needed.values()), "more tasks need more"
-    for memory in (*needed.values(), needed[4] + 1, needed[12] * 2):
+    assert len(set(needed.values())) > 1
+    for memory in (*needed.values(), max(needed.values()) * 2):
         most = max(n for n, least in needed.items() if least <= memory)
-        assert meta.tasks_within(memory, wide, *shapes) == most
-    with pytest.raises(ValueError, match=rf"memory: got {needed[1] - 1:,} bytes, expected at least the {needed[1]:,} "):
-        meta.tasks_within(needed[1] - 1, wide, *shapes)
+        assert meta.tasks_within(memory, loss, w, x) == most
+    least = min(needed.values()) - 1
+    with pytest.raises(ValueError, match=rf"memory: got {least:,} bytes, expected at least {needed[1]:,}, which one"):
+        meta.tasks_within(least, loss, *jax.eval_shape(lambda *a: a, w, x))
+
+
+def test_tasks_of_which_there_are_several_numbers_have_no_bound():
+    with pytest.raises(ValueError, match=r"tasks: got the leading axes \[\(3,\), \(6,\)\], expected one of at least 1"):
+        meta.tasks_within(10**9, task_loss, START, (SUPPORT, QUERY[:3]))
