@@ -132,8 +132,13 @@ def test_demonstrations_of_ones_own_are_learned_from(execute):
 
 
 @pytest.mark.slow
-def test_curves_and_characters_are_meta_learned(execute):
+def test_curves_characters_and_a_loss_are_meta_learned(execute):
     text = printed(execute("meta_learn_anything", steps=60, tasks=24))
+    own, other = (
+        float(re.search(rf"after {name}: ([\d.]+)%", text).group(1))
+        for name in ("its own demonstration", "another one's")
+    )
+    assert own > other
     before, after = map(float, re.search(r"meta-learned: error ([\d.]+), after one step ([\d.]+)", text).groups())
     average = float(re.search(r"average: error [\d.]+, after one step ([\d.]+)", text).group(1))
     assert after < 0.9 * before

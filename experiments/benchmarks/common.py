@@ -61,7 +61,7 @@ class Report:
         print(f"{self.benchmark:10s} {name:60s} {value:>20s} {note}", flush=True)
         self.folder.mkdir(parents=True, exist_ok=True)
         content = {"benchmark": self.benchmark, **provenance.origin(), "rows": self.rows}
-        content["versions"] |= provenance.versions(("torch", "warp-lang", "hydrax"))
+        content["versions"] |= provenance.versions(("torch", "warp-lang", "hydrax", "jaxopt", "higher", "torchopt"))
         file = self.benchmark if accelerated() else f"{self.benchmark}-cpu"
         (self.folder / f"{file}.json").write_text(json.dumps(content, indent=1) + "\n")
 

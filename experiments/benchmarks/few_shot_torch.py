@@ -1,6 +1,7 @@
 """The meta-step of `few_shot.py` in PyTorch: written out, with torch.func, and by libraries for meta-learning.
 
-Parameters are dictionaries as there, with kernels [F, C, 3, 3]; images are [N, B, C, H, W].
+Parameters are dictionaries as there, with kernels [F, C, 3, 3], and the rows of the last layer in the order of features
+[C, H, W]; images are [N, B, C, H, W].
 """
 
 from collections.abc import Callable
@@ -31,7 +32,7 @@ def loss(params: Params, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
 
 
 def by_loop(params: Params, tasks: Tasks, steps: int, rate: float) -> Params:
-    """Computes the meta-gradient task by task with autograd, as learn2learn does."""
+    """Computes the meta-gradient task by task with autograd."""
     leaves = {name: value.detach().requires_grad_() for name, value in params.items()}
     total = [torch.zeros_like(value) for value in leaves.values()]
     for x, y, query, wanted in zip(*tasks, strict=True):
@@ -101,25 +102,10 @@ def by_torchopt(params: Params, tasks: Tasks, steps: int, rate: float) -> Params
     return {name: value.grad for name, value in leaves.items()}  # type: ignore[misc]
 
 
-def by_learn2learn(params: Params, tasks: Tasks, steps: int, rate: float) -> Params:
-    """Computes the meta-gradient with learn2learn (Arnold et al. 2020), task by task as its own example does."""
-    import learn2learn
-
-    module = Classifier(params)
-    maml = learn2learn.algorithms.MAML(module, lr=rate)
-    for x, y, query, wanted in zip(*tasks, strict=True):
-        adapted = maml.clone()
-        for _ in range(steps):
-            adapted.adapt(functional.cross_entropy(adapted(x), y))
-        (functional.cross_entropy(adapted(query), wanted) / len(tasks[0])).backward()
-    return {name: value.grad for name, value in module.params.items()}  # type: ignore[misc]
-
-
 PEERS: dict[str, Callable[..., Params]] = {
     "PyTorch, loop": by_loop,
     "PyTorch, torch.func": by_vmap,
     "PyTorch, torch.func, compiled": torch.compile(by_vmap),
-    "learn2learn": by_learn2learn,
     "higher": by_higher,
     "TorchOpt": by_torchopt,
 }

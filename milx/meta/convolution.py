@@ -1,7 +1,8 @@
 """Convolutions that stay fast where every task has kernels of its own.
 
 After adaptation every task has its own kernels, and `vmap` over tasks turns `lax.conv` into a grouped convolution,
-which XLA runs badly everywhere. Written as one matrix product, the same convolution becomes a batched matrix product.
+which XLA runs badly on CPUs and, depending on its size, on GPUs. Written as one matrix product, the same convolution
+becomes a batched matrix product.
 """
 
 import functools
