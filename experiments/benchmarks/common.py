@@ -33,6 +33,12 @@ def median_ms(
     return 1e3 * statistics.median(times)
 
 
+def lax_convolution(x: jax.Array, kernel: jax.Array, stride: int) -> jax.Array:
+    """Convolves [B, H, W, C] with [k, k, C, F] and SAME padding, as one would write it first."""
+    numbers = ("NHWC", "HWIO", "NHWC")
+    return jax.lax.conv_general_dilated(x, kernel, (stride, stride), "SAME", dimension_numbers=numbers)
+
+
 def gib(compiled: jax.stages.Compiled) -> float:
     """Returns the memory a compiled program needs beside arguments and results; PyTorch's numbers include those."""
     memory = compiled.memory_analysis()

@@ -89,15 +89,9 @@ def by_milx(params: Params, tasks: tuple[jax.Array, ...], steps: int) -> Params:
     return meta.meta_gradient(task_loss, params, tasks, at_once=None if common.accelerated() else 1)[0]
 
 
-def lax_convolution(x: jax.Array, kernel: jax.Array, stride: int) -> jax.Array:
-    """Convolves as one would write it first."""
-    numbers = ("NHWC", "HWIO", "NHWC")
-    return jax.lax.conv_general_dilated(x, kernel, (stride, stride), "SAME", dimension_numbers=numbers)
-
-
 def by_jax(params: Params, tasks: tuple[jax.Array, ...], steps: int) -> Params:
     """Computes the meta-gradient as one would write it first."""
-    inner = functools.partial(loss, lax_convolution)
+    inner = functools.partial(loss, common.lax_convolution)
 
     def task_loss(params: Params, x: jax.Array, y: jax.Array, query: jax.Array, wanted: jax.Array) -> jax.Array:
         for _ in range(steps):
@@ -112,7 +106,7 @@ def by_jaxopt(params: Params, tasks: tuple[jax.Array, ...], steps: int) -> Param
     """Computes the meta-gradient with jaxopt (Blondel et al. 2022), through its unrolled gradient descent."""
     import jaxopt
 
-    inner = functools.partial(loss, lax_convolution)
+    inner = functools.partial(loss, common.lax_convolution)
     options = {"maxiter": steps, "tol": 0.0, "acceleration": False, "implicit_diff": False, "unroll": True}
     solver = jaxopt.GradientDescent(inner, stepsize=RATE, **options)
 

@@ -64,12 +64,6 @@ def vmapped_gradient(loss: Loss, params: Params, batch: TaskBatch) -> Params:
     return jax.grad(loss, has_aux=True)(params, batch)[0]
 
 
-def lax_convolution(x: jax.Array, kernel: jax.Array, stride: int) -> jax.Array:
-    """Convolves as one would write it first."""
-    numbers = ("NHWC", "HWIO", "NHWC")
-    return jax.lax.conv_general_dilated(x, kernel, (stride, stride), "SAME", dimension_numbers=numbers)
-
-
 def floor_ms(config: Config, env: Env, tasks: int, frames: int) -> tuple[float, str]:
     """Estimates the least time of a meta-gradient: operations and bytes over ceilings that are measured here.
 
@@ -160,7 +154,7 @@ def measure_domain(name: str) -> None:
             "in a scan",
         )
     report.measure("milx, rematerialised", "ms", lambda: gradient(accelerated, True))
-    ours, layers.conv2d = layers.conv2d, lax_convolution
+    ours, layers.conv2d = layers.conv2d, common.lax_convolution
     for mixed in (True, False) if accelerated else (False,):
         kind = "bfloat16" if mixed else "float32"
         report.attempt(
