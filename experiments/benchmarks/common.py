@@ -1,6 +1,7 @@
 """What all benchmarks share: timing, and one JSON file of rows in experiments/results/benchmarks/."""
 
 import dataclasses
+import datetime
 import json
 import pathlib
 import statistics
@@ -60,13 +61,18 @@ class Report:
     rows: list[dict[str, Any]] = dataclasses.field(default_factory=list)
 
     def add(self, name: str, median: float | None, unit: str, memory: float | None = None, note: str = "") -> None:
-        """Adds a row; a median of None says that this was not run, and the note why."""
+        """Adds a row, named "question: who" (`summary.py`); a median of None says that it was not run, the note why."""
         row = {"name": name, "median": median, "unit": unit, "peak_memory_gib": memory, "note": note}
         self.rows.append(row)
         value = "not run" if median is None else f"{median:,.4g} {unit}"
         print(f"{self.benchmark:10s} {name:60s} {value:>20s} {note}", flush=True)
+        self.write()
+
+    def write(self) -> None:
+        """Writes what there is."""
         self.folder.mkdir(parents=True, exist_ok=True)
-        content = {"benchmark": self.benchmark, **provenance.origin(), "rows": self.rows}
+        today = datetime.datetime.now(datetime.UTC).date().isoformat()
+        content = {"benchmark": self.benchmark, "date": today, **provenance.origin(), "rows": self.rows}
         content["versions"] |= provenance.versions(("torch", "warp-lang", "hydrax", "jaxopt", "higher", "torchopt"))
         file = self.benchmark if accelerated() else f"{self.benchmark}-cpu"
         (self.folder / f"{file}.json").write_text(json.dumps(content, indent=1) + "\n")

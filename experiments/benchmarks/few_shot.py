@@ -209,16 +209,18 @@ def measure(report: common.Report, network: str, steps: int, count: int, peers: 
         report.attempt(f"{case}: {name}", "ms", run)
         if report.rows[row]["median"] is not None:
             report.rows[row]["note"] = f"{reference.pop('apart', '')}{time.perf_counter() - began:.0f} s in all"
+            report.write()
             print(" " * 11, report.rows[row]["note"], flush=True)
 
 
 def main(_: list[str]) -> None:
     """Measures and writes the JSON files."""
     milx.configure()
-    for network in _NETWORKS.value:
+    accelerated = common.accelerated()
+    for network in _NETWORKS.value or (list(NETWORKS) if accelerated else ["omniglot"]):
         report = common.Report(f"few_shot-{network}", pathlib.Path(_OUT.value))
         for steps in map(int, _STEPS.value):
-            for count in map(int, _TASKS.value):
+            for count in map(int, _TASKS.value or (("4", "64") if accelerated else ("4",))):
                 measure(report, network, steps, count, _PEERS.value)
 
 
@@ -234,8 +236,10 @@ if __name__ == "__main__":
         "TorchOpt",
     ]
     _OUT = flags.DEFINE_string("out", str(common.RESULTS), "Folder of the JSON files.")
-    _NETWORKS = flags.DEFINE_multi_enum("networks", list(NETWORKS), list(NETWORKS), "Which (repeat the flag).")
-    _TASKS = flags.DEFINE_list("tasks", ["4", "64"], "Numbers of tasks.")
+    _NETWORKS = flags.DEFINE_multi_enum(
+        "networks", None, list(NETWORKS), "Which; all, or Omniglot's on a CPU, by default (repeat the flag)."
+    )
+    _TASKS = flags.DEFINE_list("tasks", None, "Numbers of tasks; 4 and 64, or 4 on a CPU, by default.")
     _STEPS = flags.DEFINE_list("steps", ["1", "5"], "Numbers of inner steps.")
     _PEERS = flags.DEFINE_multi_enum("peers", names, names, "Who; milx comes first (repeat the flag).")
     app.run(main)

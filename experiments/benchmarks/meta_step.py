@@ -37,7 +37,7 @@ from milx.types import Params, TaskBatch
 _OUT = flags.DEFINE_string("out", str(common.RESULTS), "Folder of the JSON file.")
 _TASKS = flags.DEFINE_integer("tasks", None, "Tasks in a meta-batch; the paper's by default.")
 _FRAMES = flags.DEFINE_integer("frames", None, "Time steps of a demonstration; all by default.")
-_DOMAINS = flags.DEFINE_list("domains", ["reach", "push"], "Which sizes.")
+_DOMAINS = flags.DEFINE_list("domains", None, "Which sizes; reach and push, or reach on a CPU, by default.")
 
 
 def domain(name: str) -> tuple[Config, Env]:
@@ -174,7 +174,7 @@ def measure_domain(name: str) -> None:
 def main(_: list[str]) -> None:
     """Measures and writes the JSON files."""
     milx.configure()
-    for name in _DOMAINS.value:
+    for name in _DOMAINS.value or (("reach", "push") if common.accelerated() else ("reach",)):
         measure_domain(name)
 
 

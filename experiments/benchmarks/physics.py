@@ -107,7 +107,7 @@ def main(_: list[str]) -> None:
     report.attempt("mujoco.rollout", unit, lambda: measure_rollout(env, worlds, threads), f"{threads} threads")
     for how in ("jacfwd", "mapped jvp"):
         report.measure(
-            f"Jacobians, {how}", "1/s", functools.partial(measure_jacobians, env, points, how), f"{points} at once"
+            f"Jacobians: {how}", "1/s", functools.partial(measure_jacobians, env, points, how), f"{points} at once"
         )
 
 

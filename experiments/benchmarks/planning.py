@@ -161,17 +161,18 @@ def main(_: list[str]) -> None:
                 search = searcher.iterate(search, key)
             costs.append(float(searcher.cost(search)))
         ms = common.median_ms(searcher.iterate, searcher.begin(0), jax.random.key(0), repeats=_REPEATS.value)
-        report.add(f"push, {name}: rollouts of {_SAMPLES.value} candidates at once", 1e3 * _SAMPLES.value / ms, "1/s")
+        rate = 1e3 * _SAMPLES.value / ms
+        report.add(f"rollouts of {_SAMPLES.value} candidates of push at once: {name}", rate, "1/s")
         return statistics.median(costs), None
 
     for name, prepare in {
-        "torques": scene.torques,
-        "torques, hydrax": scene.hydrax,
-        "velocities of the hand": lambda: scene.velocities(approximate=False),
-        "velocities of the hand, cheaper physics": lambda: scene.velocities(approximate=True),
+        "milx, torques": scene.torques,
+        "hydrax, torques": scene.hydrax,
+        "milx, velocities of the hand": lambda: scene.velocities(approximate=False),
+        "milx, velocities of the hand, cheaper physics": lambda: scene.velocities(approximate=True),
     }.items():
         add = report.attempt if prepare == scene.hydrax else report.measure
-        label, note = f"push, {name}: cost after {rollouts} rollouts", f"median of {_SEEDS.value} searches"
+        label, note = f"cost of push after {rollouts} rollouts: {name}", f"median of {_SEEDS.value} searches"
         add(label, "", functools.partial(measure, name, prepare), note)
 
 

@@ -87,6 +87,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "meta-world": lambda: board.markdown(board.read()),
     "meta-world-unseen": lambda: board.markdown(board.read("unseen:make")),
     "benchmarks": lambda: summary.table(list(cells.read(RESULTS / "benchmarks").values())),
+    "benchmarks-origins": lambda: summary.origins(list(cells.read(RESULTS / "benchmarks").values())),
 }
 """What makes the table of each name."""
 

@@ -1,0 +1,77 @@
+"""What is made of several runs of a benchmark: medians, and by which factor milx is better."""
+
+import json
+import pathlib
+import sys
+
+import pytest
+
+sys.path.insert(0, str(pathlib.Path(__file__).parents[2] / "experiments" / "benchmarks"))
+import everything
+import summary
+
+SCRIPT = """
+import json, pathlib, sys
+folder = pathlib.Path(sys.argv[1].removeprefix("--out="))
+run = int(folder.name)
+folder.mkdir(parents=True)
+rows = [{"name": "milx", "median": [3.0, 1.0, 2.0][run], "unit": "ms", "peak_memory_gib": run + 0.5}]
+rows += [{"name": "peer", "median": None if run == 1 else 6.0, "unit": "ms", "peak_memory_gib": None}]
+(folder / "slow.json").write_text(json.dumps({"benchmark": "slow", "rows": rows[:1] if run == 2 else rows}))
+sys.exit(3 if run == 1 else 0)
+"""
+
+
+def test_runs_are_merged_and_those_that_fail_are_told(tmp_path, monkeypatch):
+    (tmp_path / "slow.py").write_text(SCRIPT)
+    monkeypatch.setattr(everything, "HERE", tmp_path)
+    folders = [tmp_path / "runs" / str(i) for i in range(3)]
+    worked = [everything.run("slow", [], folders[: i + 1], tmp_path / "out") for i in range(3)]
+    assert worked == [True, False, True]
+    ours, peer = json.loads((tmp_path / "out" / "slow.json").read_text())["rows"]
+    assert (ours["median"], ours["runs"], ours["peak_memory_gib"]) == (2.0, [3.0, 1.0, 2.0], 2.5)
+    assert (peer["median"], peer["runs"], peer["peak_memory_gib"]) == (6.0, [6.0, None, None], None)
+
+
+def row(name, *runs, unit="ms"):
+    return {"name": name, "median": sorted(runs)[len(runs) // 2], "unit": unit, "runs": list(runs)}
+
+
+@pytest.mark.parametrize(("unit", "fast", "slow"), [("ms", 2.0, 6.0), ("", 2.0, 6.0), ("frames/s", 6.0, 2.0)])
+def test_milx_is_better_by_as_much_as_it_is_faster(unit, fast, slow):
+    assert summary.advantages(row("milx", fast), row("peer", slow), unit) == [3.0]
+    assert summary.advantages(row("milx", slow), row("peer", fast), unit) == [pytest.approx(1 / 3)]
+
+
+def test_the_spread_is_that_of_the_ratios_in_the_same_run():
+    """Both slow down together, so their ratio is the same in every run, though each spreads by a factor of two."""
+    result = {
+        "benchmark": "b",
+        "hardware": "1 x NVIDIA",
+        "rows": [row("case: milx", 1.0, 2.0, 1.5), row("case: peer", 3.0, 6.0, 4.5)],
+    }
+    for each in result["rows"]:
+        each |= {"peak_memory_gib": None, "note": ""}
+    *_, peer = summary.table([result]).splitlines()
+    assert peer == "| b | case: peer | 4.5 ms (3 to 6) | 3 (3 to 3) |  |"
+
+
+def test_a_peer_is_compared_with_what_answers_the_same_question_at_the_same_precision():
+    rows = [
+        row("case: milx, bfloat16", 1.0),
+        row("case: milx, float32", 2.0),
+        row("case: peer, float32", 4.0),
+        row("case: bound", 0.5),
+        row("other: peer, float32", 8.0),
+        row("case: peer, float32, rate", 8.0, unit="1/s"),
+    ]
+    asked = summary.questions({"benchmark": "b", "hardware": "", "rows": rows})
+    rivals = {each["name"]: question.rival(each) for question in asked for each in question.rows}
+    assert rivals == {
+        "case: milx, bfloat16": None,
+        "case: milx, float32": None,
+        "case: peer, float32": rows[1],
+        "case: bound": rows[0],
+        "other: peer, float32": None,
+        "case: peer, float32, rate": None,
+    }
