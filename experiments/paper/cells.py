@@ -246,7 +246,7 @@ class Cells:
             save=lambda write, state, score: save_state(write, state, score, clock.elapsed(), training.dataset_hash),
         )
         metrics = MetricsWriter(checkpoints.folder.parent, int(state.step), print)
-        with contextlib.closing(metrics), stop.listen():
+        with metrics, stop.listen():
             state = loop.fit(scan, state, key, training, config.train, checkpoints, hooks, clock, stop)
         if stop.asked:
             raise SystemExit(stop.exit_code)

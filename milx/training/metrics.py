@@ -5,7 +5,7 @@ import json
 import pathlib
 import time
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, Self
 
 from tensorboardX import summary
 from tensorboardX.event_file_writer import EventsWriter
@@ -20,7 +20,8 @@ class MetricsWriter:
     """Writes numbers to metrics.jsonl and to TensorBoard events.
 
     Both are written before `write` returns, without threads or queues. What cannot be written, for example on a full
-    disk, is reported and left out; TensorBoard's file and wandb, once they have failed, are not tried any more.
+    disk, is reported and left out; TensorBoard's file and wandb, once they have failed, are not tried any more. Used in
+    a `with` statement, at whose end both are closed.
 
     Args:
         folder: the run's.
@@ -70,11 +71,14 @@ class MetricsWriter:
             events.flush()
             self._events = events
 
-    def close(self) -> None:
-        """Closes TensorBoard's file, and waits for wandb."""
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
+        """Closes TensorBoard's file, and waits for wandb, which is told whether there was an error."""
         if self._tracker is not None:
             with self._reported("wandb's metrics", (Exception,)):
-                self._tracker.close()
+                self._tracker.close(failed=error is not None)
         if self._events is not None:
             with self._reported("TensorBoard's events"):
                 self._events.close()

@@ -154,7 +154,7 @@ class Run(abc.ABC):
             is_tracked = config.wandb is not None and parallel.is_first_host()
             track = functools.partial(Tracker, self.folder, self.config) if is_tracked else None
             metrics = MetricsWriter(self.folder, int(state.step), self._warn, track)
-            with contextlib.closing(metrics), self.phase("meta-training", config.steps, int(state.step)):
+            with metrics, self.phase("meta-training", config.steps, int(state.step)):
                 hooks = self._hooks(metrics, training.dataset_hash)
                 state = loop.fit(scan, state, key, training, config, checkpoints, hooks, self.clock, stop)
         if parallel.on_any_host(bool(stop.asked)):

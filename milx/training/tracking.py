@@ -53,6 +53,6 @@ class Tracker:
         """Hands one line of metrics over to wandb's own process."""
         self._run.log({"step": step, **values})
 
-    def close(self) -> None:
-        """Waits until everything is sent, for a minute at most."""
-        self._run.finish()
+    def close(self, failed: bool) -> None:
+        """Tells wandb how the run ended, and waits until everything is sent, for a minute at most."""
+        self._run.finish(exit_code=int(failed))

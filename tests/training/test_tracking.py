@@ -1,5 +1,6 @@
 """Metrics in Weights & Biases, without a network."""
 
+import contextlib
 import re
 import sys
 import time
@@ -24,10 +25,9 @@ def tracker(tmp_path, monkeypatch):
 def test_a_run_that_goes_on_hands_all_its_lines_to_the_same_run_of_wandb(tmp_path, tracker):
     reports = []
     for first in (1, 2):
-        writer = MetricsWriter(tmp_path, first - 1, reports.append, tracker)
-        for step in range(first, first + 2):
-            writer.write(step, {"loss": 1.0 / (1 << step)})
-        writer.close()
+        with MetricsWriter(tmp_path, first - 1, reports.append, tracker) as writer:
+            for step in range(first, first + 2):
+                writer.write(step, {"loss": 1.0 / (1 << step)})
         time.sleep(1.1)  # the names of wandb's folders have seconds
     assert not reports
     logs = sorted((tmp_path / "wandb").glob("offline-run-*/run-*.wandb"))
@@ -40,10 +40,9 @@ def test_a_run_that_goes_on_hands_all_its_lines_to_the_same_run_of_wandb(tmp_pat
 def test_without_wandb_training_goes_on(tmp_path, tracker, monkeypatch):
     reports = []
     monkeypatch.setitem(sys.modules, "wandb", None)  # as if it were not installed
-    writer = MetricsWriter(tmp_path, 0, reports.append, tracker)
-    for step in (1, 2):
-        writer.write(step, {"loss": 0.5})
-    writer.close()
+    with MetricsWriter(tmp_path, 0, reports.append, tracker) as writer:
+        for step in (1, 2):
+            writer.write(step, {"loss": 0.5})
     assert len(reports) == 1
     assert reports[0].startswith("wandb's metrics could not be written: import of wandb")
     assert [line["step"] for line in read_metrics(tmp_path / "metrics.jsonl")] == [1, 2]
@@ -51,12 +50,11 @@ def test_without_wandb_training_goes_on(tmp_path, tracker, monkeypatch):
 
 def test_a_failure_of_wandb_is_reported_once(tmp_path, tracker):
     reports = []
-    writer = MetricsWriter(tmp_path, 0, reports.append, tracker)
-    assert writer._tracker is not None
-    writer._tracker._run.finish()  # so that it takes no more
-    for step in (1, 2):
-        writer.write(step, {"loss": 0.5})
-    writer.close()
+    with MetricsWriter(tmp_path, 0, reports.append, tracker) as writer:
+        assert writer._tracker is not None
+        writer._tracker._run.finish()  # so that it takes no more
+        for step in (1, 2):
+            writer.write(step, {"loss": 0.5})
     assert [report.partition(": ")[0] for report in reports] == ["wandb's metrics could not be written"]
 
 
@@ -64,11 +62,22 @@ def test_a_run_that_somebody_else_has_begun_stays_theirs(tmp_path, tracker):
     import wandb
 
     theirs, reports = wandb.init(project="theirs", dir=str(tmp_path)), []
-    writer = MetricsWriter(tmp_path, 0, reports.append, tracker)
-    writer.write(1, {"loss": 0.5})
-    writer.close()
+    with MetricsWriter(tmp_path, 0, reports.append, tracker) as writer:
+        writer.write(1, {"loss": 0.5})
     theirs.log({"mine": 0.125})
     assert theirs.summary["mine"] == 0.125
     assert theirs.summary.get("loss") is None
     theirs.finish()
     assert not reports
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_wandb_is_told_whether_a_run_has_failed(tmp_path, tracker, fails):
+    codes = []
+    with contextlib.suppress(FloatingPointError), MetricsWriter(tmp_path, 0, print, tracker) as writer:
+        assert writer._tracker is not None
+        finish = writer._tracker._run.finish
+        writer._tracker._run.finish = lambda exit_code: (codes.append(exit_code), finish(exit_code))
+        if fails:
+            raise FloatingPointError
+    assert codes == [int(fails)]
