@@ -294,6 +294,15 @@ def test_histories_that_cannot_be_are_refused():
         check_config(config)
 
 
+def test_filters_are_made_from_the_middle_of_what_each_camera_sees_first(folder, tmp_path):
+    config = recorded.config_for(folder, preset="cpu")
+    config.recorded.crop, config.network.fixed_filters = CROP, "kmeans"
+    data, run = DataSet(folder), make_run(config, tmp_path / "run", QUIET)
+    first = [middle(data.read(task, 0, np.zeros(1, int)).image) for task in (2, 3, 4)]  # those for training
+    for found, name in zip(run._first_images(), sorted(SIZES), strict=True):
+        np.testing.assert_array_equal(found, np.concatenate([image[name] for image in first]))
+
+
 def test_crops_that_cannot_be_are_refused():
     simulated = make_config("reach", preset="cpu")
     simulated.recorded.crop = 1
