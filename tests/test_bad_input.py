@@ -94,6 +94,7 @@ def almost_good_demos(draw):
     return Demo(**arrays)
 
 
+@pytest.mark.slow
 def test_demos():
     good = []
 
@@ -151,6 +152,7 @@ def test_configs(data):
                 assert np.isfinite(value), field
 
 
+@pytest.mark.slow
 @cases("flags")
 @given(data=st.data())
 def test_flags(data):

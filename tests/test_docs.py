@@ -16,8 +16,8 @@ from milx.config import registry
 DOCS = pathlib.Path(__file__).parents[1] / "docs"
 FIXTURES = pathlib.Path(__file__).parent / "fixtures"
 PAGES = sorted(DOCS.rglob("*.md"))
-SLOW = ("render", "your_own_demonstrations")
-"""Names of pages whose blocks take more than ten seconds."""
+SLOW = ("add_an_environment", "meta_learn_anything", "render", "your_own_demonstrations")
+"""Names of pages whose blocks take more than five seconds."""
 
 
 def blocks(path, language):

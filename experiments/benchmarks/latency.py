@@ -31,7 +31,9 @@ from milx.trajopt.ilqr import Options
 from milx.types import Observation
 
 _OUT = flags.DEFINE_string("out", str(common.RESULTS), "Folder of the JSON file.")
-_TASKS = flags.DEFINE_integer("tasks", 150, "Tasks of the evaluation, ten trials each.")
+_TASKS = flags.DEFINE_integer(
+    "tasks", None, "Tasks of the evaluation, ten trials each; 150, or 15 on a CPU, by default."
+)
 _PLANS = flags.DEFINE_integer("plans", None, "Demonstrations planned at once; 4,096, or 50 on a CPU, by default.")
 
 
@@ -51,12 +53,13 @@ def measure_evaluation(config: Config, env: Env, report: common.Report) -> None:
     """Adds the row of the closed-loop evaluation: adaptation included, demonstrations given."""
     method = methods.make(config, env.spec)
     params = method.init(jax.random.key(0), workload.unit_whitening(env))
-    demos = workload.random_demos(env, _TASKS.value, 1)
-    config.evaluation.batch = _TASKS.value
+    tasks = _TASKS.value or (150 if common.accelerated() else 15)
+    demos = workload.random_demos(env, tasks, 1)
+    config.evaluation.batch = tasks
     milliseconds = common.median_ms(
         lambda: closed_loop.run_trials(env, method, params, demos, config.evaluation, jax.random.key(0)), repeats=5
     )
-    trials = _TASKS.value * config.evaluation.trials
+    trials = tasks * config.evaluation.trials
     report.add(f"{trials:,} closed-loop trials of {env.horizon} steps", 1e-3 * milliseconds, "s")
 
 

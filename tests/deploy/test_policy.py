@@ -61,8 +61,8 @@ def test_loaded_parameters_are_those_of_the_best_checkpoint(trained, policy):
     assert policy.config == trained.config
 
 
-def test_jitted_adapt_is_the_method_s(policy, demo, task_params):
-    expected = policy.method.adapt(policy.params, demo)
+def test_adapt_is_the_method_s(policy, demo, task_params):
+    expected = jax.jit(policy.method.adapt)(policy.params, demo)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=0, atol=1e-5), task_params, expected)
     change = jax.tree.map(lambda a, b: float(jnp.abs(a - b).max()), task_params["policy"], policy.params["policy"])
     assert max(jax.tree.leaves(change)) > 1e-3, "adaptation changes the parameters by more than the tolerance"

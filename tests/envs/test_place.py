@@ -318,6 +318,7 @@ def test_the_thing_hangs_from_the_tip_and_stays_in_the_hand(env, task):
         assert max(tops) == pytest.approx(float(env.hand(state.qpos)[0][2]), abs=1e-6)
 
 
+@pytest.mark.slow
 def test_a_film_goes_on_with_the_fall_from_where_the_hand_held_the_thing(env, dropped):
     tasks, states, (fallen, _) = jax.tree.map(lambda x: x[3], dropped)
     frames = jax.jit(Place((72, 80)).film)(tasks, jax.tree.map(lambda x: x[None], states)).astype(int)

@@ -81,6 +81,7 @@ def test_same_controls_give_the_trajectory_of_c_mujoco(env, actions, states):
         np.testing.assert_allclose(states.qvel[i], qvel, rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_planner_s_step_is_close_to_the_exact_one(env, task, actions, states):
     """Bounds the error of one step of the midpoint method, which falls with the third power of its length."""
     states, _ = states

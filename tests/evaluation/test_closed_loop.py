@@ -137,6 +137,7 @@ def test_no_trial_takes_place_in_the_demonstration_s_scene(trained, split, monke
     jax.tree.map(np.testing.assert_array_equal, some, jax.tree.map(lambda x: x[:, :4], scene))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("trials", "asked", "tried"), [(3, 1, 1), (2, 2, 2), (2, 10, 2)])
 def test_baselines_run_in_the_first_trials(trained, monkeypatch, trials, asked, tried):
     env, key = trained.run.env, simulated.trial_key("test")
@@ -171,6 +172,7 @@ def compiled(caplog, *names):
     return found
 
 
+@pytest.mark.slow
 def test_programs_compiled_ahead_are_found(trained, caplog):
     method, config = Replay(), dataclasses.replace(trained.config.evaluation, trials=4)
     names, run = ("adapt_tasks", "run_tasks"), functools.partial(closed_loop.run_trials, trained.run.env, method, ())

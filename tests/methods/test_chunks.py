@@ -76,6 +76,7 @@ def test_demonstrations_hold_the_actions_of_their_own_next_time_steps(folder):
     np.testing.assert_array_equal(in_chunks(whole.action, CHUNK)[spread(12, 5)], read.action)
 
 
+@pytest.mark.slow
 def test_a_policy_predicts_chunks_and_its_export_executes_them_alike(cache, folder, tmp_path):
     config = recorded.config_for(folder, preset="cpu")
     config.recorded.horizon, config.network.fc_layers = 6, (8,)

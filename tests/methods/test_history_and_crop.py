@@ -266,6 +266,7 @@ def differences(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("history", [1, 2])
 def test_only_a_history_tells_by_how_much_the_state_has_changed(cache, differences, tmp_path, history):
     """Without one, the state before is unknown: half of the variance of the difference of two equal draws."""

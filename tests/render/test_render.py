@@ -51,6 +51,7 @@ def change(model, seed):
     return other
 
 
+@pytest.mark.slow
 def test_an_mjx_model_counts_as_a_model_with_its_values_does(model, data):
     others = [change(model, seed) for seed in (0, 1)]
     own = mjx.put_model(model)

@@ -126,6 +126,12 @@ def lively():
     return jax.jit(lambda s: jnp.mean(weights * render(s).color)), scene
 
 
+@pytest.fixture(scope="module")
+def gradient(lively):
+    mean_color, scene = lively
+    return jax.jit(jax.grad(mean_color))(scene)
+
+
 # Colors enter linearly, so a long step costs nothing; poses enter smoothly where the shadow's edge is left alone.
 @pytest.mark.parametrize(
     ("field", "rows", "step", "rtol"),
@@ -137,7 +143,7 @@ def lively():
         ("light_xpos", slice(1, 2), 1e-2, 2e-2),
     ],
 )
-def test_gradient_agrees_with_differences(lively, field, rows, step, rtol):
+def test_gradient_agrees_with_differences(lively, gradient, field, rows, step, rtol):
     mean_color, scene = lively
     value = np.asarray(getattr(scene, field))
     direction = np.zeros_like(value)
@@ -147,14 +153,12 @@ def test_gradient_agrees_with_differences(lively, field, rows, step, rtol):
     above, below = (
         float(mean_color(dataclasses.replace(scene, **{field: value + s * direction}))) for s in (step, -step)
     )
-    slope = float(np.sum(np.asarray(getattr(jax.grad(mean_color)(scene), field)) * direction))
+    slope = float(np.sum(np.asarray(getattr(gradient, field)) * direction))
     assert abs(slope) > 1e-3
     np.testing.assert_allclose(slope, (above - below) / (2 * step), rtol=rtol)
 
 
-def test_all_gradients_are_finite_and_geometry_has_none(lively):
-    mean_color, scene = lively
-    gradient = jax.grad(mean_color)(scene)
+def test_all_gradients_are_finite_and_geometry_has_none(gradient):
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
     for field in ("geom_xpos", "geom_xmat", "geom_size", "cam_xpos", "cam_xmat"):
         assert not np.asarray(getattr(gradient, field)).any()

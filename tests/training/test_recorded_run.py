@@ -289,6 +289,7 @@ def test_updates_that_are_not_finite_are_skipped_counted_and_named(folder, tmp_p
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(params))
 
 
+@pytest.mark.slow
 def test_a_run_without_a_finite_update_stops(folder, tmp_path, monkeypatch):
     run, _ = run_with_losses(folder, tmp_path, monkeypatch, lambda n: jnp.inf * jnp.ones_like(n, jnp.float32))
     monkeypatch.setattr("milx.training.loop.MOST_IN_VAIN", 30)  # after two scans of 20
@@ -459,7 +460,7 @@ def test_a_full_disk_stops_neither_training_nor_the_metrics_that_still_fit(tmp_p
     assert time.monotonic() - began < 20
     assert sum("TensorBoard's events could not be written: " in report for report in reports) == 1
     assert sum(report.startswith("metrics of step 199 could not be written: ") for report in reports) == 1
-    writer.write(200, {"loss": 0.5})  # there is room again
-    writer.close()
+    with writer:
+        writer.write(200, {"loss": 0.5})  # there is room again
     lines = read_metrics(tmp_path / "metrics.jsonl")
     assert lines[0] == {"step": 1, "loss": 1.0}

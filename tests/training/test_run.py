@@ -149,6 +149,7 @@ def test_metrics_hold_a_loss_and_a_validation_at_every_interval(trained):
         assert success * trials == pytest.approx(round(success * trials), abs=1e-5)
 
 
+@pytest.mark.slow
 def test_best_checkpoint_has_the_highest_validation_success(trained, tmp_path, monkeypatch):
     successes = iter([0.25, 0.75, 0.5])
     monkeypatch.setattr(SimulatedRun, "_validate", lambda *_: (next(successes), {}))

@@ -107,6 +107,7 @@ def test_plans_are_found_and_demonstrations_begin_with_them(cart, scenes, plans)
     assert jax.vmap(cart.success)(task, still).mean() < 0.5
 
 
+@pytest.mark.slow
 def test_scenes_without_a_plan_begin_again_with_those_of_others(cart, plans):
     """Compares rounds with searches in a loop that begin with two plans, although those that failed are better."""
     kept = np.arange(6) >= 4
