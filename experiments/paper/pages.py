@@ -82,6 +82,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "published-ladder": lambda: _published("", "ladder"),
     "published-relatives": lambda: _published("", "relatives"),
     "figure3": lambda: figure3.markdown(list(cells.read(RESULTS / "figure3").values())),
+    "figure3-paper": lambda: figure3.markdown(list(cells.read(RESULTS / "figure3_paper").values())),
     "figure3-push": lambda: figure3.markdown(list(cells.read(RESULTS / "figure3_push").values())),
     "ablations": lambda: ablations.markdown(cells.read(RESULTS / "ablations"), list(ablations.ABLATIONS), seeds=2),
     "meta-world": lambda: board.markdown(board.read()),
