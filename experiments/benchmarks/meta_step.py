@@ -67,16 +67,17 @@ def vmapped_gradient(loss: Loss, params: Params, batch: TaskBatch) -> Params:
 def floor_ms(config: Config, env: Env, tasks: int, frames: int) -> tuple[float, str]:
     """Estimates the least time of a meta-gradient: operations and bytes over ceilings that are measured here.
 
-    Convolutions in bfloat16, fully connected layers left out. A forward pass counts 1, a backward pass 2 (1 for the
-    first layer, which needs no gradient of the image); the support demonstration takes one of each, and twice that
-    again for the Hessian-vector product; the query one of each. Every pass reads its inputs and writes its outputs.
+    Convolutions in bfloat16, or float32 on a CPU; fully connected layers are left out. A forward pass counts 1, a
+    backward pass 2 (1 for the first layer, which needs no gradient of the image); the support demonstration takes one
+    of each, and twice that again for the Hessian-vector product; the query one of each. Every pass reads its inputs and
+    writes its outputs.
     """
     assert isinstance(config.network, PolicyConfig)
-    n = 8192
-    a = jax.random.normal(jax.random.key(0), (n, n), jnp.bfloat16)
+    n, kind, copies = (8192, jnp.bfloat16, 2**28) if common.accelerated() else (2048, jnp.float32, 2**26)
+    a = jax.random.normal(jax.random.key(0), (n, n), kind)
     product = jax.jit(lambda a: a @ a)
     operations_per_s = 2 * n**3 / (1e-3 * common.median_ms(product, a, repeats=10))
-    copied = jnp.zeros(2**28)
+    copied = jnp.zeros(copies)
     bytes_per_s = 2 * copied.nbytes / (1e-3 * common.median_ms(jax.jit(lambda x: x + 1), copied, repeats=10))
 
     operations = traffic = 0.0
@@ -88,13 +89,13 @@ def floor_ms(config: Config, env: Env, tasks: int, frames: int) -> tuple[float, 
         products = 2 * outputs * channels * config.network.kernel**2
         passes = (1 + (2 if i else 1)) * (1 + 2 + 1)
         operations += passes * products
-        traffic += passes * (2 if i else 1) * inputs + passes * 2 * outputs
+        traffic += passes * (a.itemsize if i else 1) * inputs + passes * a.itemsize * outputs
         channels = filters
     count = tasks * frames
     by_operations, by_bytes = 1e3 * count * operations / operations_per_s, 1e3 * count * traffic / bytes_per_s
     note = (
-        f"{count * operations / 1e9:.0f} GFLOP at {operations_per_s / 1e12:.0f} TFLOP/s: {by_operations:.2f} ms; "
-        f"{count * traffic / 1e9:.1f} GB at {bytes_per_s / 1e12:.2f} TB/s: {by_bytes:.2f} ms"
+        f"{count * operations / 1e9:.0f} GFLOP at {operations_per_s / 1e12:.3g} TFLOP/s: {by_operations:.3g} ms; "
+        f"{count * traffic / 1e9:.1f} GB at {bytes_per_s / 1e12:.3g} TB/s: {by_bytes:.3g} ms"
     )
     return max(by_operations, by_bytes), note
 
@@ -166,9 +167,8 @@ def measure_domain(name: str) -> None:
         report.attempt(
             f"PyTorch, {mode}, {kind}", "ms", functools.partial(measure_torch, config, env, batch, mode, bf16)
         )
-    if accelerated:
-        least, note = floor_ms(config, env, tasks, frames)
-        report.add("roofline", least, "ms", note=note)
+    least, note = floor_ms(config, env, tasks, frames)
+    report.add("roofline", least, "ms", note=note)
 
 
 def main(_: list[str]) -> None:
