@@ -29,7 +29,7 @@ def problems(data: DataSet) -> list[str]:
     for field, values in read.items():
         finite = values[np.isfinite(values).all(axis=1)]
         for i in np.flatnonzero(finite.std(axis=0) < MIN_STD).tolist() if len(finite) else ():
-            found.append(f"{entry(head, field, i)} is constant: it says nothing")
+            found.append(f"{head.entry(field, i)} is constant: it says nothing")
     found += _classes(head, read.get("action", np.zeros((0, head.action_size))))
     for number, task in enumerate(head.tasks):
         if head.image_shape is not None and task.lengths:
@@ -40,20 +40,17 @@ def problems(data: DataSet) -> list[str]:
     return found
 
 
-def entry(head: Header, field: str, index: int) -> str:
-    """Names an entry of the state or of the action."""
-    names = getattr(head, f"{field}_names")
-    return f"{field}[{index}]" + (f" ({names[index]})" if names else "")
-
-
 def _refusals(data: DataSet) -> list[str]:
     """Finds what training refuses."""
     found, head = [], data.header
     for split in SPLITS:
         if not head.of_split(split):
             found.append(f"no {split} tasks: training refuses this data set")
-        elif not any(len(head.tasks[i].lengths) > 1 and any(head.tasks[i].has_action) for i in head.of_split(split)):
-            found.append(f"no {split} task with two demonstrations, of which one shows actions: training refuses this")
+        elif not any(sum(head.tasks[i].has_action) > 1 for i in head.of_split(split)):
+            unless = ""
+            if any(len(head.tasks[i].lengths) > 1 and any(head.tasks[i].has_action) for i in head.of_split(split)):
+                unless = " unless method.given is video+state or video"
+            found.append(f"no {split} task with two demonstrations that show actions: training refuses this{unless}")
     for number, task in enumerate(head.tasks):
         if len(task.lengths) < 2:
             found.append(f"task {task.name!r} has {len(task.lengths)} demonstration: one more must be the query")
@@ -66,7 +63,7 @@ def _refusals(data: DataSet) -> list[str]:
                     continue
                 step, i = np.argwhere(~(np.abs(values) <= LARGEST))[0].tolist()
                 where = f"demonstration {demo} of task {task.name!r}, time step {step}"
-                found.append(f"{entry(head, field, i)} is {values[step, i]} in {where}: training refuses this")
+                found.append(f"{head.entry(field, i)} is {values[step, i]} in {where}: training refuses this")
     return found
 
 
@@ -74,7 +71,7 @@ def _classes(head: Header, actions: np.ndarray) -> list[str]:
     """Finds entries of the actions that take two values and are not marked so, and the opposite."""
     found = []
     for i in range(head.action_size):
-        count, name = len(np.unique(actions[:, i])), entry(head, "action", i)
+        count, name = len(np.unique(actions[:, i])), head.entry("action", i)
         if i in head.class_indices and count > 2:
             found.append(f"{name} is marked as taking two values and has {count}: only the outermost will be done")
         elif i not in head.class_indices and count == 2:
@@ -100,7 +97,7 @@ def _disappointments(head: Header) -> list[str]:
     if lengths and max(lengths) > _SPREAD * min(lengths):
         found.append(f"lengths from {min(lengths)} to {max(lengths)} steps: all are resampled to recorded.horizon")
     if head.image_shape is None:
-        found.append("no images: policies see states only")
+        found.append("no images: " + ("policies see states only" if head.state_size else "policies see nothing at all"))
     for name, size in by_field(head.image_shape).items():
         if size[0] > MANY_ROWS:
             found.append(f"{name} of {size[0]} x {size[1]}: import it with fewer rows (--height)")
@@ -152,7 +149,7 @@ def describe(data: DataSet, console: Console) -> None:
         with np.errstate(invalid="ignore"):
             for i, column in enumerate(values.T):
                 shown = (np.nanmin(column), np.nanmean(column), np.nanmax(column), np.nanstd(column))
-                table.add_row(printable(entry(head, field, i)), *(f"{value:.4g}" for value in shown))
+                table.add_row(printable(head.entry(field, i)), *(f"{value:.4g}" for value in shown))
     console.print(table)
 
 

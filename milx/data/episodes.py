@@ -13,11 +13,13 @@ from rich.progress import track
 from milx.core.commands import command
 from milx.core.messages import warn
 from milx.data import cameras, splits
-from milx.data.dataset import Writer
+from milx.data.dataset import LARGEST, Writer
+from milx.data.header import named_entry
 from milx.data.splits import PREFIX
 from milx.types import Demo, ImageShape
 
 FLAGS = flags.FLAGS
+flags.disclaim_key_flags()  # so that --help of an importer lists the flags defined here
 
 
 class Episode(NamedTuple):
@@ -167,8 +169,8 @@ def checked(episode: Episode, contents: Contents) -> Demo:
     """Reads an episode, with states and actions in float32.
 
     Raises:
-        ValueError: if it cannot be read, has other sizes, or holds a number that is not finite in float32; the message
-            names the episode and the time step.
+        ValueError: if it cannot be read, has other sizes, or holds a number that is not finite in float32 or beyond
+            LARGEST; the message names the entry, the episode and the time step.
     """
     demo = episode.read()
     vectors = {"state": demo.state if contents.state_size else None, "action": demo.action}
@@ -181,10 +183,11 @@ def checked(episode: Episode, contents: Contents) -> Demo:
         if value.shape != expected:
             got = f"got shape {list(value.shape)}, expected {list(expected)}"
             raise ValueError(f"{field} of episode {episode.name}: {got} (--skip_bad leaves it out)")
-        if not np.isfinite(value).all():
-            step, entry = np.argwhere(~np.isfinite(value))[0].tolist()
-            got = f"got {value[step, entry]} at time step {step}, expected finite numbers"
-            raise ValueError(f"{field}[{entry}] of episode {episode.name}: {got} (--skip_bad leaves it out)")
+        if not (np.abs(value) <= LARGEST).all():
+            step, index = np.argwhere(~(np.abs(value) <= LARGEST))[0].tolist()
+            where = named_entry(field, index, getattr(contents, f"{field}_names"))
+            got = f"got {value[step, index]} at time step {step}, expected finite numbers of at most {LARGEST:.0e}"
+            raise ValueError(f"{where} of episode {episode.name}: {got} (--skip_bad leaves it out)")
     return Demo(cameras.fitted(demo.image, contents.image_shape), **vectors)
 
 

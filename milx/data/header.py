@@ -65,6 +65,15 @@ class Header:
         """Lists the numbers of the split's tasks."""
         return [i for i, task in enumerate(self.tasks) if task.split == split]
 
+    def entry(self, field: str, index: int) -> str:
+        """Names an entry of the "state" or of the "action"."""
+        return named_entry(field, index, getattr(self, f"{field}_names"))
+
+
+def named_entry(field: str, index: int, names: tuple[str, ...]) -> str:
+    """Names an entry of a field by its index, and by its name if the entries have names."""
+    return f"{field}[{index}]" + (f" ({names[index]})" if names else "")
+
 
 def read_header(folder: pathlib.Path) -> Header:
     """Reads the header of a data set.

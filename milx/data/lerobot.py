@@ -30,6 +30,7 @@ from milx.types import Demo, by_field
 
 _IMAGES, _NUMBERS = ("video", "image"), ("float32", "float64", "int64")
 _CONVERTER = "python -m lerobot.datasets.v30.convert_dataset_v21_to_v30"
+"""The one of LeRobot 0.4, which looks for ROOT/REPO_ID; later versions have moved it."""
 _BATCH_BYTES = 1 << 30
 _PLACEHOLDER = re.compile(r"\{(\w+)(?::0?(\d)d)?\}")
 
@@ -167,11 +168,12 @@ class LeRobot:
             features, fps = info["features"], info["fps"]
         except (KeyError, TypeError, ValueError, RecursionError) as error:
             raise ValueError(f"{path}: expected LeRobot's metadata: {error!r}") from error
-        if version.startswith("v2"):
+        if version == "v2.1":
             folder = self.root.resolve()
             where = f"--repo-id={shlex.quote(folder.name)} --root={shlex.quote(str(folder.parent))} --push-to-hub=false"
             command = f"{_CONVERTER} {where}"
-            raise ValueError(f"{path}: codebase_version: got {version}, expected v3.0; convert it with `{command}`")
+            how = f"LeRobot 0.4 converts it: `{command}`"
+            raise ValueError(f"{path}: codebase_version: got {version}, expected v3.0; {how}")
         if not version.startswith("v3"):
             raise ValueError(f"{path}: codebase_version: got {version}, expected v3.0")
         if not isinstance(features, dict) or not isinstance(fps, int | float) or not 0 < fps < 10_000:

@@ -8,6 +8,8 @@ belongs to, by names such as "lift/demo_0", the file without its suffix and the 
 
 import contextlib
 import functools
+import json
+import math
 import pathlib
 import re
 from collections.abc import Iterator
@@ -56,8 +58,9 @@ class Robomimic:
             image_shape = cameras.joined({name: shape(key) for name, key in self.cameras.items()})
             sizes = {name: _dataset(file, f"{lead}/{name}", 2).shape[1] for name in self.state}
             actions = _dataset(file, f"data/{demo}/{action}", 2).shape[1] if action else 0
+            fps = _fps(file)
         names = tuple(f"{name}.{i}" for name, size in sizes.items() for i in range(size))
-        self.contents = Contents(image_shape, len(names), actions, state_names=names)
+        self.contents = Contents(image_shape, len(names), actions, fps, state_names=names)
 
     def episodes(self, task: str) -> list[Episode]:
         """Lists all demonstrations.
@@ -128,6 +131,15 @@ def _open(path: pathlib.Path) -> Iterator[Any]:
         raise
     except Exception as error:  # on damaged bytes h5py raises nearly all types of errors
         raise FileError(f"{path}: expected an HDF5 file that can be read: {error!r:.300}") from error
+
+
+def _fps(file: Any) -> float | None:
+    """Returns the time steps in a second, robosuite's control frequency; None where the file does not say."""
+    try:
+        found = json.loads(file["data"].attrs["env_args"])["env_kwargs"]["control_freq"]
+    except (KeyError, TypeError, ValueError, RecursionError):
+        return None
+    return float(found) if isinstance(found, int | float) and 0 < found < math.inf else None
 
 
 def _demos(file: Any) -> list[str]:

@@ -50,7 +50,15 @@ def test_nothing_is_wrong_with_a_good_set(tmp_path):
     [
         (lambda tasks: tasks.pop(2), "no test tasks: training refuses this data set"),
         (lambda tasks: tasks.pop(), "19 training tasks: with fewer than about 20"),
-        (lambda tasks: tasks[1][1].pop(), "no validation task with two demonstrations, of which one shows actions"),
+        (
+            lambda tasks: tasks[1][1].pop(),
+            "no validation task with two demonstrations that show actions: training refuses this",
+        ),
+        (
+            lambda tasks: tasks[1][1].__setitem__(0, dataclasses.replace(good(), action=None)),
+            "no validation task with two demonstrations that show actions: training refuses this unless method.given "
+            "is video+state or video",
+        ),
         (lambda tasks: tasks[0][1].pop(), "task 'task 0' has 1 demonstration: one more must be the query"),
         (
             lambda tasks: tasks.__setitem__(0, ("train", [dataclasses.replace(d, action=None) for d in tasks[0][1]])),
@@ -91,7 +99,7 @@ def test_what_will_go_wrong_is_said(tmp_path, change, problem):
     found = check.problems(write(tmp_path / "set", tasks))
     assert found[0].startswith(problem), found
     # A task that lacks a demonstration is told beside what that means for its split.
-    assert len(found) == (2 if "no validation task" in problem else 1)
+    assert len(found) == (2 if problem.endswith("show actions: training refuses this") else 1)
 
 
 def test_the_description_counts_and_measures(tmp_path):

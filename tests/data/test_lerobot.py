@@ -4,8 +4,10 @@ import dataclasses
 import io
 import json
 import pathlib
+import re
 import shlex
 import shutil
+import subprocess
 import sys
 
 import numpy as np
@@ -127,14 +129,40 @@ def test_some_episodes_are_selected_and_bad_ones_left_out(copy, capsys):
     with pytest.raises(ValueError, match="episodes: got '9', which fits none, expected names such as 0, 1"):
         names("9")
     broken = dataclasses.replace(found[1].read(), action=found[1].read().action.astype(float))
-    broken.action[7, 1] = 1e300  # finite, but not in float32
     found[1] = found[1]._replace(read=lambda: broken)
-    with pytest.raises(ValueError, match=r"action\[1\] of episode 1: got inf at time step 7, expected finite numbers"):
-        episodes.write(copy / "out", found, open_set(copy).contents, (0.3, 0.3), "there")
-    assert not (copy / "out").exists()
-    kept = episodes.readable(found, open_set(copy).contents)
+    contents = open_set(copy).contents
+    named = contents._replace(action_names=tuple(f"motor {i}" for i in range(contents.action_size)))
+    for value, got in ((1e300, "inf"), (-1e20, r"-1\.0\d+e\+20")):
+        broken.action[7, 1] = value
+        message = rf"action\[1\] \(motor 1\) of episode 1: got {got} at time step 7, expected finite numbers of at most"
+        with pytest.raises(ValueError, match=message):
+            episodes.write(copy / "out", found, named, (0.3, 0.3), "there")
+        assert not (copy / "out").exists()
+    broken.action[7, 1] = 1e300
+    kept = episodes.readable(found, contents)
     assert [episode.name for episode in kept] == ["0", *map(str, range(2, 9))]
-    assert "episode 1 is left out: action[1] of episode 1: got inf" in " ".join(capsys.readouterr().err.split())
+    assert "episode 1 is left out: action[1]" in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize("module", ["milx.data.lerobot", "milx.data.robomimic", "milx.worlds.record"])
+def test_help_lists_every_flag(module):
+    said = subprocess.run([sys.executable, "-m", module, "--help"], capture_output=True, text=True, timeout=60).stdout
+    shared = ("height", "validation", "test", "family", "splits")
+    own = (
+        ("demos", "python", "workers")
+        if module == "milx.worlds.record"
+        else (
+            "camera",
+            "state",
+            "action",
+            "task",
+            "classes",
+            "episodes",
+            "skip_bad",
+        )
+    )
+    for flag in (*shared, *own):
+        assert re.search(rf"^\s*--(\[no\])?{flag}:", said, re.MULTILINE), flag
 
 
 def test_states_and_actions_may_lack():
@@ -177,16 +205,18 @@ def test_a_value_that_is_stored_once_and_meant_often_is_refused(copy, monkeypatc
 def test_older_versions_name_the_converter(copy):
     """Reads the command as a shell would: the converter looks for ROOT/REPO_ID."""
     change_info(copy, codebase_version="v2.1")
-    with pytest.raises(ValueError, match=r"codebase_version: got v2.1, expected v3.0; convert it with `") as error:
+    message = r"codebase_version: got v2\.1, expected v3\.0; LeRobot 0\.4 converts it: `"
+    with pytest.raises(ValueError, match=message) as error:
         open_set(copy)
     words = shlex.split(str(error.value).split("`")[1])
     assert words[:3] == ["python", "-m", "lerobot.datasets.v30.convert_dataset_v21_to_v30"]
     given = dict(word.removeprefix("--").split("=") for word in words[3:])
     assert pathlib.Path(given["root"]) / given["repo-id"] == copy.resolve()
     assert given["push-to-hub"] == "false"
-    change_info(copy, codebase_version="v4.0")
-    with pytest.raises(ValueError, match=r"codebase_version: got v4\.0, expected v3\.0"):
-        open_set(copy)
+    for other in ("v2.0", "v4.0"):
+        change_info(copy, codebase_version=other)
+        with pytest.raises(ValueError, match=rf"codebase_version: got {other}, expected v3\.0$"):
+            open_set(copy)
 
 
 @pytest.mark.parametrize("path", ["../../secret.parquet", "/etc/passwd", "{chunk_index.__class__}.parquet", "linked"])

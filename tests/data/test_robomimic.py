@@ -68,6 +68,28 @@ def test_a_single_file_and_a_mapping(tmp_path):
     assert [(e.task, e.length) for e in found] == [("a", 7), ("b", 9), ("a", 6), ("b", 8)]
 
 
+def test_several_cameras_and_the_control_frequency_are_kept(copy, tmp_path):
+    rng, wrist = np.random.default_rng(0), {}
+    with h5py.File(copy, "a") as file:
+        file["data"].attrs["env_args"] = '{"env_name": "Lift", "env_kwargs": {"control_freq": 20}}'
+        for name, demo in file["data"].items():
+            wrist[name] = rng.integers(0, 256, (len(demo["actions"]), 6, 8, 3), np.uint8)
+            demo["obs/eye_in_hand_image"] = wrist[name]
+    source, alone = open_set(copy, camera="agentview_image,eye_in_hand_image"), open_set(copy, camera="agentview_image")
+    assert source.contents.fps == 20
+    for episode, other in zip(source.episodes("file"), alone.episodes("file"), strict=True):
+        image = episode.read().image
+        np.testing.assert_array_equal(image["eye_in_hand"], wrist[episode.name.split("/")[1]])
+        np.testing.assert_array_equal(image["agentview"], other.read().image)
+
+
+@pytest.mark.parametrize("args", ["{}", "[", '{"env_kwargs": 3}', '{"env_kwargs": {"control_freq": "20"}}'])
+def test_files_that_do_not_say_how_fast_they_are_have_no_rate(copy, args):
+    with h5py.File(copy, "a") as file:
+        file["data"].attrs["env_args"] = args
+    assert open_set(copy).contents.fps is None
+
+
 def replace(path, name, value):
     with h5py.File(path, "a") as file:
         del file[name]

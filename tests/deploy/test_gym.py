@@ -45,6 +45,14 @@ def test_gymnasium_makes_them_itself():
     assert set(gym.IDS) == {"reach", "reach_state", "push", "place", "grasp"} <= set(envs.ENVS)
 
 
+@pytest.mark.slow
+def test_the_checker_of_gymnasium_is_content_with_push():
+    """Compiles the dynamics and the renderer of a whole world."""
+    made = gymnasium.make("milx/Push-v0", split="test", image_shape=(16, 20))
+    with warnings.catch_warnings(action="ignore"):
+        check_env(made.unwrapped)
+
+
 def test_an_episode_is_the_environments(gym_env):
     """Compares states, images, rewards and success, step by step."""
     env, rng = gym_env.env, np.random.default_rng(0)
