@@ -2,9 +2,9 @@
 
 At the coordinates (s, t) of a surface a texture of h rows and w columns shows the bilinear interpolation of its texels,
 of which row i and column j lies at s = (j + 1/2) / w and t = (i + 1/2) / h. It repeats itself with a period of 1 in
-both directions, and multiplies the color of the geom. MuJoCo's renderer differs in what follows: it multiplies
-highlights, too, takes textures in sRGB (`colorspace`) for what they are, shows no textures of one channel, and has
-smaller versions of a texture for where it is seen from far away, where fine ones flicker here.
+both directions, and multiplies the color that the lights give the geom, at most 1. MuJoCo's renderer differs in what
+follows: it takes textures in sRGB (`colorspace`) for what they are, shows no textures of one channel, and has smaller
+versions of a texture for where it is seen from far away, where fine ones flicker here.
 """
 
 from typing import NamedTuple

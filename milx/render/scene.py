@@ -145,7 +145,6 @@ class Renderer:
         # MJX keeps no light poses. Lights are fixed to their bodies, so they follow from those.
         body_xpos = array(data.xpos, -1, 3)[own.light_bodyid]
         body_xmat = array(data.xmat, -1, 3, 3)[own.light_bodyid]
-        head = own.vis.headlight
         return Scene(
             geom_xpos=array(data.geom_xpos, -1, 3),
             geom_xmat=array(data.geom_xmat, -1, 3, 3),
@@ -158,7 +157,7 @@ class Renderer:
             light_ambient=array(model.light_ambient, -1, 3),
             light_diffuse=array(model.light_diffuse, -1, 3),
             light_specular=array(model.light_specular, -1, 3),
-            headlight=array(head.active * np.stack([head.ambient, head.diffuse, head.specular]), 3, 3),
+            headlight=array(shade.headlight(own), 3, 3),
         )
 
     def render(self, scene: Scene) -> Frame:
@@ -179,18 +178,18 @@ class Renderer:
             family, second, frame = jax.tree.map(lambda x: x[winner], _in_camera(scene.texture, scene))
             rows = tuple(tuple(frame[:, i, j] for j in range(4)) for i in range(3))
             rgb = textures.mix(rgb, family, tuple(second[:, i] for i in range(3)), rows, point)
-        if self._images is not None and texcoord is not None:
-            rgb = images.mix(self._images, rgb, winner, texcoord)
         material = shade.Material(rgb, *(made_of[:, i] for i in range(3)))
         color = shade.emitted(material)
         for casts, lights in self._lights(scene).items():
             shadow = partial(self._in_shadow, maps, visible, point) if casts else None
             added = shade.reflected(lights, material, point, normal, shadow)
             color = tuple(before + more for before, more in zip(color, added, strict=True))
-
+        color = tuple(jnp.clip(channel, 0.0, 1.0) for channel in color)
+        if self._images is not None and texcoord is not None:
+            color = images.mix(self._images, color, winner, texcoord)
         shape = (self.height, self.width)
         return Frame(
-            color=jnp.stack([jnp.where(hit, jnp.clip(c, 0.0, 1.0), 0.0).reshape(shape) for c in color], axis=-1),
+            color=jnp.stack([jnp.where(hit, channel, 0.0).reshape(shape) for channel in color], axis=-1),
             depth=distance.reshape(shape),
             geom_id=geom_id.reshape(shape),
         )

@@ -11,11 +11,15 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import mujoco
+import numpy as np
 
 from milx.render.raycast import Vector, dot
 
 # Squared lengths and bases of powers are kept above this, so that neither they nor their gradients are ever NaN.
 _SMALL = 1e-12
+_WITHOUT_LIGHTS = 0.3
+"""The ambient light in MuJoCo where no light is on."""
 
 
 class Material(NamedTuple):
@@ -55,6 +59,15 @@ def _power(base: jax.Array, exponent: jax.Array) -> jax.Array:
 def emitted(material: Material) -> Vector:
     """Computes the color without any light: three [P] arrays."""
     return tuple(material.emission * channel for channel in material.rgb)
+
+
+def headlight(model: mujoco.MjModel) -> np.ndarray:
+    """Returns the ambient, diffuse and specular color of the headlight, [3, 3]; some is ambient if no light is on."""
+    head = model.vis.headlight
+    colors = head.active * np.stack([head.ambient, head.diffuse, head.specular])
+    if not head.active and not model.light_active.any():
+        colors[0] = _WITHOUT_LIGHTS
+    return colors
 
 
 def reflected(

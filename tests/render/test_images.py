@@ -10,7 +10,8 @@ from milx.render import Renderer, images
 from milx.render.scene import to_uint8
 
 HEIGHT, WIDTH, ROWS, COLUMNS = 30, 40, 5, 7
-QUAD = """<mujoco><statistic extent="1"/><visual><headlight active="0"/></visual><worldbody>
+QUAD = """<mujoco><statistic extent="1"/><visual>
+    <headlight ambient="1 1 1" diffuse="0 0 0" specular="0 0 0"/></visual><worldbody>
     <camera name="eye" pos=".1 -.2 2" fovy="50"/></worldbody></mujoco>"""
 COLOR = 0.5, 1.0, 0.25
 
@@ -28,7 +29,7 @@ def square(textures, geoms):
         spec.add_texture(
             name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, height=height, width=width, nchannel=channels
         ).data = texels.tobytes()
-        spec.add_material(name=name, emission=1).textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
+        spec.add_material(name=name).textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
     corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0], [0, 0, -0.5]], float)
     faces = [0, 1, 2, 0, 2, 3, 1, 0, 4, 2, 1, 4, 3, 2, 4, 0, 3, 4]
     mesh = {"uservert": corners.ravel().tolist(), "userface": faces}
@@ -74,6 +75,21 @@ def test_a_square_shows_its_texture_where_scipy_does(channels):
     assert 0.3 < inside.mean() < 1
     np.testing.assert_array_equal(geom >= 0, inside)
     np.testing.assert_allclose(color[inside], wanted[inside], rtol=0, atol=1e-6)
+
+
+def test_a_texture_multiplies_highlights_and_at_most_full_light():
+    """Adds emission, and the headlight's highlight below the camera: where they exceed 1, they count as 1."""
+    texels = np.random.default_rng(2).integers(0, 256, (ROWS, COLUMNS, 3), np.uint8)
+    model, data = square({"noise": texels}, [("noise", "seen", [0, 0, 0])])
+    model.mat_emission[:] = 0.5
+    model.vis.headlight.ambient, model.vis.headlight.specular = (0.2,) * 3, (1.0,) * 3
+    bare, _ = square({"noise": np.full((1, 1, 3), 255, np.uint8)}, [("noise", "seen", [0, 0, 0])])
+    bare.mat_emission[:] = 0.5
+    bare.vis.headlight.ambient, bare.vis.headlight.specular = (0.2,) * 3, (1.0,) * 3
+    (color, _), (lit, _) = drawn(model, data), drawn(bare, data)
+    plain, inside = expected(texels, 2.0)
+    assert lit[inside].max() == pytest.approx(1) and lit[inside].min() < 0.8 * COLOR[2]
+    np.testing.assert_allclose(color[inside], (lit * plain / COLOR)[inside], rtol=0, atol=1e-6)
 
 
 def test_every_mesh_has_its_own_texture_and_bare_ones_keep_their_color():

@@ -50,6 +50,21 @@ def test_diffuse_light_follows_lamberts_law(sunlit, degrees):
     np.testing.assert_allclose(color, np.broadcast_to(expected, color.shape), atol=1e-5)
 
 
+@pytest.mark.parametrize(("light", "ambient"), [("", 0.3), ('<light active="false"/>', 0.3), ("<light/>", 0.0)])
+def test_where_no_light_is_on_things_show_three_tenths_of_their_color(light, ambient):
+    """As MuJoCo's renderer has it; a light that is on, but shines elsewhere, leaves them dark."""
+    model = mujoco.MjModel.from_xml_string(
+        f"""<mujoco><visual><headlight active="0"/></visual><worldbody>{light}
+        <geom type="sphere" size=".5" pos="0 0 1" rgba=".4 .8 .2 1"/>
+        <camera name="eye" pos="0 0 3"/></worldbody></mujoco>"""
+    )
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    renderer = Renderer(model, "eye", 9, 9)
+    color = np.asarray(renderer.render(renderer.scene(data)).color)
+    np.testing.assert_allclose(color[4, 4], ambient * np.array([0.4, 0.8, 0.2]), atol=1e-6)
+
+
 def test_specular_light_follows_the_half_vector():
     light, peak, shininess = np.array([0.5, 0.3, 1.5]), np.array([0.9, 0.6, 0.3]), 0.2
     render, scene = build(
