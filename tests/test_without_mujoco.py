@@ -54,6 +54,24 @@ for needs in (
     assert done.stderr == ""
 
 
+def test_the_parameters_of_a_shipped_policy_need_none():
+    """Prints how many arrays a policy for recorded demonstrations takes from push, and from which configuration."""
+    program = """
+from milx import methods
+from milx.config.assemble import make_config
+from milx.deploy.pretrained import parameters
+from milx.training.start import start_from
+from milx.types import Spec
+
+config, spec = make_config("recorded", preset="fast"), Spec((16, 16), 4, 4, None, ())
+config.network.kernel = parameters("push")[0].network.kernel
+start_from("push", methods.params_like(methods.make(config, spec), spec), config)
+"""
+    done = run(program)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert done.stdout == "milx: 47 of 50 parameters start from push; all others are drawn\n"
+
+
 @pytest.mark.slow
 def test_a_life_on_recorded_demonstrations_needs_none(tmp_path):
     """Imports, trains, evaluates, exports and loads, with the parameters of a life with MuJoCo."""

@@ -1,16 +1,19 @@
 """Policies that ship with milx: `milx.load("push")`."""
 
+import collections
 import pathlib
 from typing import Any
 
 from milx import envs, methods
 from milx.config import assemble
 from milx.config.registry import load_plugins
+from milx.config.schema import Config
 from milx.core import files, pytrees
 from milx.core.messages import warn
 from milx.deploy import policy
 from milx.deploy.policy import Policy
 from milx.methods import params_like
+from milx.types import Array
 
 FOLDER = pathlib.Path(__file__).parent / "weights"
 FORMAT = 1
@@ -38,26 +41,34 @@ def load(run: str | pathlib.Path) -> Policy:
         ValueError: if it is neither, if the run has no checkpoint yet, or if the files have been changed.
     """
     load_plugins()  # a run may be of another package's method or environment
-    is_run = (pathlib.Path(run) / "config.json").is_file()
-    if is_run and str(run) in names():
-        warn(f"loading the run in ./{run}, not the policy {str(run)!r} that ships with milx")
-    if is_run or (pathlib.Path(run).exists() and str(run) not in names()):
+    if _is_run(run):
         return policy.load_run(run)
-    if str(run) not in names():
-        expected = f"the folder of a run, or one of {', '.join(names())}, which ship with milx"
-        raise ValueError(f"run: got {str(run)!r}, expected {expected}")
-    reached = result(str(run))
-    if (number := reached.get("format", 1)) != FORMAT:  # the first had no number
-        got = f"got format {number!r:.100}, expected {FORMAT}"
-        raise files.FileError(f"{_path(str(run), 'result.json')}: {got}: it may be of a later milx")
-    config = assemble.from_dict(reached["config"])
+    name = str(run)
+    config = _config(name)
     spec = envs.of_config(config).spec
     method = methods.make(config, spec)
-    path = _path(str(run), "params.npz")
-    params = pytrees.read(path, like=params_like(method, spec))
-    if pytrees.fingerprint(params) != reached["params_hash"]:
-        raise files.FileError(f"{path}: has changed, expected the parameters that ship with milx")
+    params = pytrees.read(_path(name, "params.npz"), like=params_like(method, spec))
+    _check_unchanged(name, params)
     return Policy(method, spec, params, config)
+
+
+def parameters(run: str | pathlib.Path) -> tuple[Config, dict[str, Array]]:
+    """Reads the configuration and the parameters of what `load` takes; for a policy that ships, MuJoCo is not needed.
+
+    Returns:
+        The configuration, and the arrays by name (`pytrees.leaves`).
+
+    Raises:
+        ValueError: as `load`.
+    """
+    load_plugins()
+    if _is_run(run):
+        trained = policy.load_run(run)
+        return trained.config, pytrees.leaves(trained.params)
+    name = str(run)
+    config, arrays = _config(name), files.read_arrays(_path(name, "params.npz"))
+    _check_unchanged(name, collections.OrderedDict(arrays))  # JAX sorts the names of a plain dictionary
+    return config, arrays
 
 
 def save(trained: Policy, reached: dict[str, Any], folder: pathlib.Path) -> None:
@@ -71,6 +82,40 @@ def save(trained: Policy, reached: dict[str, Any], folder: pathlib.Path) -> None
     pytrees.write(folder / "params.npz", trained.params)
     digest = pytrees.fingerprint(trained.params)
     files.write_json(folder / "result.json", reached | {"format": FORMAT, "params_hash": digest})
+
+
+def _is_run(run: str | pathlib.Path) -> bool:
+    """Tells a run's folder from the name of a policy that ships with milx.
+
+    Raises:
+        ValueError: if it is neither.
+    """
+    has_config, ships = (pathlib.Path(run) / "config.json").is_file(), str(run) in names()
+    if has_config and ships:
+        warn(f"loading the run in ./{run}, not the policy {str(run)!r} that ships with milx")
+    if not ships and not pathlib.Path(run).exists():
+        expected = f"the folder of a run, or one of {', '.join(names())}, which ship with milx"
+        raise ValueError(f"run: got {str(run)!r}, expected {expected}")
+    return has_config or not ships
+
+
+def _config(name: str) -> Config:
+    """Reads the configuration of a policy that ships with milx.
+
+    Raises:
+        FileError: if it is of another format.
+    """
+    reached = result(name)
+    if (number := reached.get("format", 1)) != FORMAT:  # the first had no number
+        got = f"got format {number!r:.100}, expected {FORMAT}"
+        raise files.FileError(f"{_path(name, 'result.json')}: {got}: it may be of a later milx")
+    return assemble.from_dict(reached["config"])
+
+
+def _check_unchanged(name: str, params: Any) -> None:
+    """Raises FileError unless these are the parameters whose fingerprint ships with milx."""
+    if pytrees.fingerprint(params) != result(name)["params_hash"]:
+        raise files.FileError(f"{_path(name, 'params.npz')}: has changed, expected the parameters that ship with milx")
 
 
 def _path(name: str, file: str) -> pathlib.Path:

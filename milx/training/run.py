@@ -62,7 +62,8 @@ class Run(abc.ABC):
 
     Raises:
         ValueError: if the folder holds a run of another configuration (the message shows the difference), the steps are
-            not whole numbers of scans, or the tasks of a meta-batch cannot be shared evenly by the devices.
+            not whole numbers of scans, the tasks of a meta-batch cannot be shared evenly by the devices, or a run that
+            begins cannot start from `train.init` (`start.check_source`).
     """
 
     metric: str
@@ -89,6 +90,8 @@ class Run(abc.ABC):
         self.method = methods.make(config, spec)
         self.trainer = Trainer(sample, self.method, config.train, make_optimizer(config.optimizer, config.train.steps))
         self.clock = loop.Clock()
+        if config.train.init is not None and not self._checkpoints.is_dir():
+            check_source(config.train.init, self._params_like, config)  # what it refuses leaves the folder free
         self._claim_folder()
 
     @abc.abstractmethod
@@ -100,8 +103,11 @@ class Run(abc.ABC):
         """Returns shapes and types of the data of `Training.at`."""
 
     @abc.abstractmethod
-    def _validate(self, params: Params) -> tuple[float, dict[str, float]]:
-        """Validates the parameters: their score on validation tasks, and what `listening.measure` finds there."""
+    def _validate(self, params: Params) -> tuple[float | None, dict[str, float]]:
+        """Validates the parameters: their score on validation tasks, and what `listening.measure` finds there.
+
+        The score is None if it could not be found out; `_validate` has reported why.
+        """
 
     @abc.abstractmethod
     def _judge(self, params: Params) -> tuple[dict[str, Any], Callable[[dict[str, Any]], None]]:
@@ -142,8 +148,6 @@ class Run(abc.ABC):
                 return
             if isinstance(network, ConvConfig) and network.fixed_filters not in (None, fixed_filters.KMEANS):
                 fixed_filters.read_filters(network.fixed_filters, network)  # refuses a bad file before planning
-            if config.init is not None and latest is None:
-                check_source(config.init, self._params_like)  # refuses what is not there before planning
             params = self._params_like
             others = self._precompile(params)
             compiled = compile_in_background(self.trainer, params, self._shapes(), config.log_every, others)
@@ -177,12 +181,13 @@ class Run(abc.ABC):
         def validate(state: TrainState) -> float:
             with self.phase("validating"):
                 step, (score, heard) = int(state.step), self._validate(state.params)
-            values = {self.metric: score, **heard}
+            values = heard if score is None else {self.metric: score, **heard}
             metrics.write(step, {f"validation_{name}": value for name, value in values.items()})
-            self.console.print(f"step {step}: validation {self.metric} {score:.1%}{listening.in_words(heard)}")
+            found = "unknown" if score is None else f"{score:.1%}"
+            self.console.print(f"step {step}: validation {self.metric} {found}{listening.in_words(heard)}")
             if 5 * (step - first) >= config.steps - first and listening.is_deaf(heard):
                 self._warn(listening.advice(has_inner_step=hasattr(self.config.method, "inner_lr")))
-            return score
+            return UNVALIDATED if score is None else score
 
         def save(write: Callable[..., bool], state: TrainState, score: float) -> bool:
             return save_state(write, state, score, self.clock.elapsed(), dataset_hash)

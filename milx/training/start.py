@@ -13,55 +13,100 @@ from typing import Any
 
 import numpy as np
 
+from milx.config import assemble
+from milx.config.schema import Config
 from milx.core import pytrees
 from milx.core.files import FileError
 from milx.core.messages import say
-from milx.deploy.pretrained import load
-from milx.types import Params
+from milx.deploy.pretrained import parameters
+from milx.types import Array, Params
 
 FILES = (".safetensors", ".npz")
 """The endings of files with parameters."""
+_CONVOLUTIONS = ("recorded.history", "network.filters", "network.kernel", "network.strides")
+"""The fields of a configuration on which the shapes of convolutions' kernels depend, and their strides."""
+_DENSE = ("network.fc_layers",)
+"""Those on which the shapes of fully connected layers' kernels depend."""
 
 
-def start_from(source: str, params: Params) -> Params:
+def start_from(source: str, params: Params, config: Config) -> Params:
     """Replaces parameters by those of a trained policy that have the same names and sizes, or by those of a file.
 
-    The whitening stays, as it belongs to the data.
+    The whitening stays, as it belongs to the data. Reports how many parameters are replaced, and what has to be set if
+    kernels of a policy's convolutions do not fit.
 
     Args:
         source: a file that ends in one of FILES, or what `milx.load` takes.
         params: what a method has drawn.
+        config: the configuration of that method.
 
     Raises:
-        ValueError: if there is no such policy, or it has nothing in common with these parameters; if the file cannot be
-            read, or holds an array for which there is no parameter of that name and shape.
+        ValueError: as `check_source`.
     """
     learned = _learned(params)
-    theirs = _of_file(source, learned) if source.endswith(FILES) else pytrees.leaves(_of_policy(source))
+    theirs, remark = _read(source, learned, config)
     started, names = pytrees.overlaid(params, theirs)
-    if not names:
-        expected = "a policy with parameters of the same names and sizes: the same method and a similar network"
-        raise ValueError(
-            f"init: got {source!r}, which has none of the {len(learned)} parameters here, expected {expected}"
-        )
-    say(f"{len(names)} of {len(learned)} parameters start from {source}; all others are drawn")
+    say(f"{len(names)} of {len(learned)} parameters start from {source}; all others are drawn{remark}")
     return started
 
 
-def check_source(source: str, params: Params) -> None:
-    """Raises ValueError if there is nothing to start from, or a file does not fit the parameters, arrays or shapes."""
-    if source.endswith(FILES):
-        _of_file(source, _learned(params))
-    else:
-        load(source)
+def check_source(source: str, params: Params, config: Config) -> None:
+    """Checks that parameters can start from a policy or a file; takes what `start_from` takes, or shapes of parameters.
+
+    Raises:
+        ValueError: if there is no such policy, or none of its kernels has the name and shape of one of the parameters;
+            if the file cannot be read, has no arrays, or has one for which there is no parameter of that name and
+            shape.
+    """
+    _read(source, _learned(params), config)
 
 
 def _learned(params: Params) -> dict[str, Any]:
     return {name: value for name, value in pytrees.leaves(params).items() if not name.startswith("whitening")}
 
 
-def _of_policy(run: str) -> Params:
-    return {name: part for name, part in load(run).params.items() if name != "whitening"}
+def _read(source: str, learned: dict[str, Any], config: Config) -> tuple[dict[str, Array], str]:
+    """Reads what replaces the parameters, by their names; returns it with a remark on kernels that do not fit."""
+    return (_of_file(source, learned), "") if source.endswith(FILES) else _of_policy(source, learned, config)
+
+
+def _of_policy(source: str, learned: dict[str, Any], config: Config) -> tuple[dict[str, Array], str]:
+    """Reads what a policy has for the parameters, as `_read` does."""
+    theirs, arrays = parameters(source)
+    found = {
+        name: arrays[name] for name, value in learned.items() if name in arrays and arrays[name].shape == value.shape
+    }
+    convolutions = _kernels(learned, 4)
+    kernels = _kernels(learned, 2) or list(learned)  # methods of other packages may have no kernels
+    drawn = [name for name in convolutions or kernels if name not in found]
+    if not drawn:
+        return found, ""
+    if drawn[0] in arrays:
+        fields = _CONVOLUTIONS if convolutions else _DENSE
+        expected = f"{_differences(theirs, config, fields)}, as {source} has"
+    else:
+        expected = f"the same method, cameras and layers: {source} has no {drawn[0]}"
+    if not found.keys() & kernels:
+        raise ValueError(f"init: got {source!r}, none of whose kernels fits here, expected {expected}")
+    if not convolutions:
+        return found, ""
+    count = f"{len(drawn)} of the {len(convolutions)} kernels of convolutions"
+    return found, f", among them {count}, which need {expected}"
+
+
+def _kernels(arrays: dict[str, Any], axes: int) -> list[str]:
+    """Lists the names of kernels with at least so many axes; those of convolutions [k, k, channels, filters] have 4."""
+    return [name for name, array in arrays.items() if name.endswith(".kernel") and array.ndim >= axes]
+
+
+def _differences(theirs: Config, config: Config, fields: tuple[str, ...]) -> str:
+    """Lists those of the fields in which another configuration differs, with its values.
+
+    Where none does, the sizes of states and actions are the cause.
+    """
+    mine, other = assemble.fields(config), assemble.fields(theirs).items()
+    differing = [f"{name}={value}" for name, value in other if name in fields and value != mine.get(name)]
+    return ", ".join(differing) or "states and actions of the same sizes"
 
 
 def _of_file(path: str, learned: dict[str, Any]) -> dict[str, np.ndarray]:
@@ -83,4 +128,6 @@ def _of_file(path: str, learned: dict[str, Any]) -> dict[str, np.ndarray]:
         if not np.isfinite(array).all():
             raise ValueError(f"init: {path}: {name}: got values that are not finite")
         found |= dict.fromkeys(meant, array)
+    if not found:
+        raise ValueError(f"init: {path}: got no arrays, expected some of {', '.join(learned)}")
     return found

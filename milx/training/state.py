@@ -54,7 +54,7 @@ def initial_state(
     init_key, batch_key = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), 3))
     state = trainer.init(init_key, training.whitening)
     if config.train.init is not None and fresh:
-        state = dataclasses.replace(state, params=start_from(config.train.init, state.params))
+        state = dataclasses.replace(state, params=start_from(config.train.init, state.params, config))
     network = config.network
     if not isinstance(network, ConvConfig) or network.fixed_filters is None:
         return state, batch_key

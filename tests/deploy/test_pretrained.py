@@ -38,6 +38,23 @@ def test_a_shipped_policy_is_adapted_by_its_demonstration(name):
     np.testing.assert_allclose(actions, stored, rtol=0, atol=2e-3, err_msg=f"{np.array(actions).tolist()}")
 
 
+@pytest.mark.parametrize("name", ["place", "push", "reach"])
+def test_the_parameters_of_a_shipped_policy_are_those_that_it_has(name):
+    config, arrays = pretrained.parameters(name)
+    policy = milx.load(name)
+    expected = pytrees.leaves(policy.params)
+    assert config == policy.config
+    assert list(arrays) == list(expected)
+    for array, value in zip(arrays.values(), expected.values(), strict=True):
+        np.testing.assert_array_equal(array, value)
+
+
+def test_the_parameters_of_a_run_are_those_of_its_policy(trained):
+    config, arrays = pretrained.parameters(trained.folder)
+    assert config == trained.config
+    assert pytrees.fingerprint(arrays) == pytrees.fingerprint(pytrees.leaves(milx.load(trained.folder).params))
+
+
 def test_no_other_policies_ship():
     assert pretrained.names() == ["place", "push", "reach"]
 
@@ -64,8 +81,9 @@ def test_parameters_that_have_changed_are_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(pretrained, "FOLDER", tmp_path)
     params = milx.load("reach").params
     pytrees.write(tmp_path / "reach" / "params.npz", jax.tree.map(np.zeros_like, params))
-    with pytest.raises(ValueError, match=r"params\.npz: has changed, expected the parameters that ship with milx"):
-        milx.load("reach")
+    for read in (milx.load, pretrained.parameters):
+        with pytest.raises(ValueError, match=r"params\.npz: has changed, expected the parameters that ship with milx"):
+            read("reach")
 
 
 def test_a_folder_of_the_same_name_comes_first_and_is_reported(trained, tmp_path, monkeypatch, capsys):

@@ -108,7 +108,7 @@ def test_a_run_starts_from_the_parameters_of_another_as_far_as_they_fit(finished
     method = methods.make(config, run.spec)
     ones = Whitening(np.zeros(3), np.ones(3), np.zeros(2), np.ones(2))
     drawn, theirs = method.init(jax.random.key(5), ones), milx.load(run.folder).params
-    started = pytrees.leaves(start_from(str(run.folder), drawn))
+    started = pytrees.leaves(start_from(str(run.folder), drawn, config))
     for name, value in pytrees.leaves(drawn).items():
         other = pytrees.leaves(theirs).get(name)
         fits = other is not None and other.shape == value.shape and not name.startswith("whitening")
@@ -116,11 +116,11 @@ def test_a_run_starts_from_the_parameters_of_another_as_far_as_they_fit(finished
     kernel = "policy.controller.Dense_{}.kernel"
     assert (started[kernel.format(1)] != pytrees.leaves(drawn)[kernel.format(1)]).all()
     assert (started[kernel.format(2)] == pytrees.leaves(drawn)[kernel.format(2)]).all()
-    with pytest.raises(ValueError, match=r"init: got .* which has none of the 1 parameters here"):
-        start_from(str(run.folder), {"other": np.zeros(3)})
+    with pytest.raises(ValueError, match=r"init: got .*, none of whose kernels fits here, .* has no other"):
+        start_from(str(run.folder), {"other": np.zeros(3)}, config)
     config.train.init = "nowhere"
     with pytest.raises(ValueError, match="run: got 'nowhere', expected the folder of a run, or one of"):
-        make_run(config, run.folder.parent / "init", QUIET).train()
+        make_run(config, run.folder.parent / "init", QUIET)
 
 
 @pytest.mark.slow
