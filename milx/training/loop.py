@@ -25,7 +25,7 @@ class Hooks(NamedTuple):
 
     Attributes:
         log: told the step and the metrics after every scan; "steps_per_s" is among them.
-        validate: scores the parameters; the more the better.
+        validate: scores the parameters; the more the better. UNVALIDATED if that failed: training goes on.
         save: writes a checkpoint of a state with a score by `Checkpoints.save` or `Checkpoints.replace`, and says
             whether it could.
     """

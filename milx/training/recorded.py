@@ -35,7 +35,7 @@ from milx.training.metrics import read_metrics
 from milx.training.run import Run
 from milx.training.state import Training
 from milx.types import SPEC_FILE, Demo, Params, Spec, TaskBatch, by_field
-from milx.worlds.client import Client
+from milx.worlds.client import Client, WorldError
 from milx.worlds.evaluate import evaluate_in, tasks_of
 
 
@@ -218,7 +218,7 @@ class RecordedRun(Run):
     def _shapes(self) -> Recorded:
         return self.shards.shapes
 
-    def _validate(self, params: Params) -> tuple[float, dict[str, float]]:
+    def _validate(self, params: Params) -> tuple[float | None, dict[str, float]]:
         errors = self._errors(params, "validation")
         names = {"own_demo": "after", "other_demo": "other_task", "no_demo": "before"}
         heard = {name: _relative(errors, key) for name, key in names.items() if key in errors}
@@ -227,21 +227,30 @@ class RecordedRun(Run):
             return score, heard
         return self._success(params, self.config.evaluation.gym), heard | {"score": score}
 
-    def _success(self, params: Params, make: str) -> float:
-        """Computes how often a policy is successful in the world of the validation tasks, at any time."""
+    def _success(self, params: Params, make: str) -> float | None:
+        """Computes how often a policy is successful in the world of the validation tasks, at any time.
+
+        Episodes that are lost are reported; None if all are.
+        """
         policy, evaluation = Policy(self.method, self.spec, params, self.config), self.config.evaluation
-        outcomes = evaluate_in(
-            policy,
-            make,
-            tasks_of(self.data, "validation", policy),
-            controls=["own"],
-            episodes=evaluation.trials,
-            workers=evaluation.gym_workers,
-            python=evaluation.gym_python or sys.executable,
-            timeout=evaluation.gym_timeout,
-        )
+        try:
+            outcomes = evaluate_in(
+                policy,
+                make,
+                tasks_of(self.data, "validation", policy),
+                controls=["own"],
+                episodes=evaluation.trials,
+                workers=evaluation.gym_workers,
+                python=evaluation.gym_python or sys.executable,
+                timeout=evaluation.gym_timeout,
+            )
+        except WorldError as error:
+            self._warn(f"the validation in {make} failed: {error}")
+            return None
         for loss in {outcome.lost for outcome in outcomes if outcome.lost}:
             self._warn(f"an episode was lost: {loss}")
+        if all(outcome.lost for outcome in outcomes):
+            return None
         return float(np.mean([outcome.ever for outcome in outcomes]))
 
     def _judge(self, params: Params) -> tuple[dict[str, Any], Callable[[dict[str, Any]], None]]:

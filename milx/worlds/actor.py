@@ -24,22 +24,32 @@ CONTROLS = {
 
 
 def other_tasks(tasks: Sequence[Task], number: int) -> dict[str, int]:
-    """Chooses whose demonstrations mislead a policy: the next task of the same family, and of another one."""
-    others = [(number + i) % len(tasks) for i in range(1, len(tasks))]
+    """Chooses whose demonstrations mislead a policy: the next task of the same family, and of another one.
+
+    Tasks without demonstrations are passed over.
+    """
+    following = [(number + i) % len(tasks) for i in range(1, len(tasks))]
+    others = [i for i in following if tasks[i].demos]
     same = [i for i in others if tasks[i].family == tasks[number].family]
     different = [i for i in others if tasks[i].family != tasks[number].family]
     return {name: found[0] for name, found in (("same_family", same), ("other_family", different)) if found}
 
 
 class Actor:
-    """What acts in all worlds at once."""
+    """What acts in all worlds at once.
+
+    Args:
+        policy: what is evaluated.
+        tasks: of which at least one has demonstrations; the others take part in no episode.
+        worlds: how many there are.
+    """
 
     def __init__(self, policy: Policy, tasks: Sequence[Task], worlds: int):
         self._policy, self._tasks = policy, tasks
         self._others = [other_tasks(tasks, number) for number in range(len(tasks))]
         self._learned: dict[int | None, TaskParams] = {}
         self._adapt = jax.jit(policy.method.adapt)
-        first = self._learn(0)
+        first = self._learn(min(number for number, task in enumerate(tasks) if task.demos))
         copies = lambda tree: jax.tree.map(lambda x: jnp.stack([x] * worlds), tree)  # noqa: E731
         self._task_params, self._memory = copies(first), copies(policy.initial_memory)
         self._act = jax.jit(jax.vmap(policy.method.act))
@@ -50,7 +60,8 @@ class Actor:
             return control in self._others[task]
         if control == "unadapted":
             return self._policy.method.unadapted(self._policy.params) is not None
-        return control not in ("replay", "mean_action") or self._tasks[task].demos[0].action is not None
+        replayed = self._tasks[task].demos[:1] if control in ("replay", "mean_action") else ()
+        return all(demo.action is not None for demo in replayed)
 
     def assign(self, world: int, episode: Episode) -> None:
         """Puts what acts in an episode in the place of what has acted in a world."""

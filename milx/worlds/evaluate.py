@@ -58,6 +58,9 @@ def evaluate_in(
 ) -> list[Outcome]:
     """Runs episodes of every task with the policy and with controls.
 
+    A world that fails costs its episode, and is started anew for the next one. One that cannot be started, even in
+    several attempts, costs the episode that it would have run, and the other worlds run the rest.
+
     Args:
         policy: what is evaluated.
         make: "module:function", as `milx/worlds/worker.py` describes it.
@@ -74,12 +77,15 @@ def evaluate_in(
         film: number of tasks for whose first episode after their own demonstrations the images are kept.
 
     Returns:
-        What became of all episodes, in the order of tasks, controls and seeds.
+        What became of all episodes, in the order of tasks, controls and seeds. Those of a task that the world has
+        failed to demonstrate are lost.
 
     Raises:
-        WorldError: if the world cannot be started, cannot demonstrate a task, or has lost all of the first episodes.
-        ValueError: for a control that does not exist.
+        WorldError: if no world can be started, no task can be demonstrated, or all of the first episodes are lost.
+        ValueError: if there is no task, or for a control that does not exist.
     """
+    if not tasks:
+        raise ValueError("tasks: got none, expected at least one")
     if unknown := sorted(set(controls) - set(CONTROLS)):
         raise ValueError(f"controls: got {unknown[0]!r}, expected some of {', '.join(CONTROLS)}")
     controls = tuple(dict.fromkeys(controls))
@@ -87,23 +93,50 @@ def evaluate_in(
     slots = [Slot(connect, policy.spec, max_steps) for _ in range(workers)]
     with ThreadPoolExecutor(workers) as pool:
         try:
-            list(pool.map(Slot.connect, slots))
-            tasks = [slots[0].demonstrated(task, (seed - 1) % 2**31) for task in tasks]
+            list(pool.map(Slot.start, slots))
+            if all(slot.problem for slot in slots):
+                raise WorldError(slots[0].problem)
+            tasks, missing = _demonstrated(slots, tasks, (seed - 1) % 2**31)
             actor = Actor(policy, tasks, workers)
             possible = itertools.product(range(len(tasks)), controls, range(episodes))
             planned = [Episode(control, task, seed + i) for task, control, i in possible if actor.can(control, task)]
             filmed = {Episode("own", number, seed) for number in range(film)}
-            waiting = [Outcome(episode, images=[] if episode in filmed else None) for episode in planned]
-            return _run(pool, slots, actor, tasks, waiting)
+            outcomes = [
+                Outcome(episode, lost=missing.get(episode.task), images=[] if episode in filmed else None)
+                for episode in planned
+            ]
+            _run(pool, slots, actor, tasks, [outcome for outcome in outcomes if outcome.lost is None])
+            return outcomes
         finally:  # before the pool waits for what the worlds are asked
             for slot in slots:
                 slot.close()
 
 
+def _demonstrated(slots: list[Slot], tasks: Sequence[Task], seed: int) -> tuple[list[Task], dict[int, str]]:
+    """Lets a world demonstrate the tasks that have no demonstration.
+
+    Returns:
+        All tasks, and by the number of each that still has no demonstration, why.
+
+    Raises:
+        WorldError: if none has a demonstration.
+    """
+    shown, missing = list(tasks), dict[int, str]()
+    for number, task in enumerate(tasks):
+        slot = next((slot for slot in slots if slot.problem is None), slots[0])
+        try:
+            shown[number] = slot.demonstrated(task, seed)
+        except WorldError as error:
+            missing[number] = f"the task has no demonstration: {error}"
+    if len(missing) == len(tasks):
+        raise WorldError(missing[0])
+    return shown, missing
+
+
 def _run(
     pool: ThreadPoolExecutor, slots: list[Slot], actor: Actor, tasks: Sequence[Task], outcomes: list[Outcome]
-) -> list[Outcome]:
-    """Runs the episodes of `outcomes`, as many at once as there are slots, and returns them.
+) -> None:
+    """Runs the episodes of `outcomes`, as many at once as there are slots; if all are given up, the rest is lost.
 
     Raises:
         WorldError: if all of the first ones, at least ten, are lost.
@@ -111,9 +144,13 @@ def _run(
     waiting, ended = collections.deque(outcomes), list[Outcome]()
     while len(ended) < len(outcomes):
         for number, slot in enumerate(slots):
-            if slot.outcome is None and waiting:
+            if slot.outcome is None and waiting and not slot.is_given_up:
                 slot.outcome = waiting.popleft()
                 actor.assign(number, slot.outcome.episode)
+        if all(slot.is_given_up for slot in slots):
+            for outcome in waiting:
+                outcome.lost = slots[0].problem
+            return
         list(pool.map(lambda slot: slot.begin(tasks), slots))
         actions = actor.act([slot.observation for slot in slots], [slot.outcome for slot in slots])
         list(pool.map(Slot.step, slots, actions))
@@ -124,4 +161,3 @@ def _run(
                 advance(1)
         if max(10, 2 * len(slots)) <= len(ended) and all(outcome.lost for outcome in ended):
             raise WorldError(f"all of the first {len(ended)} episodes were lost: {ended[0].lost}")
-    return outcomes

@@ -116,12 +116,14 @@ def _rates(outcomes: Sequence[Outcome]) -> dict[str, Any]:
 
 
 def table(found: dict[str, Any]) -> Table:
-    """Draws a summary: a line for everything that acted, a column for every family."""
+    """Draws a summary: a line for everything that acted, a column of success at any time for every family."""
     families = list(next(iter(found.values()))["families"])
     shown = families if len(families) > 1 else []
     drawn = Table("after", "success (95%)", "at the end (95%)", "episodes")
     for family in shown:
         drawn.add_column(Text(printable(family)))
+    for column in drawn.columns:
+        column.overflow = "fold"  # a narrow console gets more lines, and all words
     for control, rates in found.items():
         lost = f", {rates['lost']} lost" if rates["lost"] else ""
         drawn.add_row(
@@ -149,4 +151,4 @@ def _with_interval(rates: dict[str, Any], name: str) -> str:
 
 def _of_family(rates: dict[str, Any], family: str) -> str:
     """A control may not exist in a family."""
-    return f"{rates['families'][family]['ever']:.1%}" if family in rates["families"] else ""
+    return _with_interval(rates["families"][family], "ever") if family in rates["families"] else ""

@@ -11,6 +11,9 @@ from milx.deploy.policy import check_observation
 from milx.types import Demo, Observation, Spec, black, from_fields
 from milx.worlds.client import Client, WorldError
 
+_STARTS = 3
+"""Attempts to start a world, after which it is given up."""
+
 
 class Task(NamedTuple):
     """A task of a world.
@@ -57,18 +60,40 @@ class Outcome:
 
 
 class Slot:
-    """One of the worlds that run side by side, and the episode in it."""
+    """One of the worlds that run side by side, and the episode in it.
+
+    Args:
+        connect: starts the world.
+        spec: the sizes of what the policy sees and does.
+        max_steps: after which an episode ends, if the world does not end it.
+
+    Attributes:
+        problem: why the world cannot be started; None if it can, as far as is known.
+        is_given_up: whether an episode has been lost because the world cannot be started: it gets no other one.
+        outcome: of the episode that is to begin or under way; None if there is none.
+        is_over: whether no episode is under way.
+        observation: what was seen last.
+    """
 
     def __init__(self, connect: Callable[[], Client], spec: Spec, max_steps: int):
         self._connect, self._spec, self._max_steps = connect, spec, max_steps
         self._client: Client | None = None
+        self.problem: str | None = None
+        self.is_given_up = False
         self.outcome: Outcome | None = None
         self.is_over = True
         self.observation = _nothing(spec)
 
-    def connect(self) -> None:
-        """Starts the world, if it is not there."""
-        self._client = self._client or self._connect()
+    def start(self) -> None:
+        """Starts the world, if it is not there; if _STARTS attempts in a row fail, there are no more of them."""
+        failures = 0
+        while self._client is None and self.problem is None:
+            try:
+                self._client = self._connect()
+            except WorldError as error:
+                failures += 1
+                if failures == _STARTS:
+                    self.problem = f"the world could not be started in {_STARTS} attempts: {error}"
 
     def close(self) -> None:
         """Ends the world."""
@@ -77,11 +102,14 @@ class Slot:
         self._client = None
 
     def demonstrated(self, task: Task, seed: int) -> Task:
-        """Lets the world demonstrate a task that has no demonstration."""
+        """Lets the world demonstrate a task that has no demonstration.
+
+        Raises:
+            WorldError: if the world cannot be started, fails, or shows no action.
+        """
         if task.demos:
             return task
-        assert self._client is not None
-        _, shown = self._client.ask({"do": "demonstrate", "task": task.name, "seed": seed})
+        _, shown = self._ask({"do": "demonstrate", "task": task.name, "seed": seed})
         if "action" not in shown:
             raise WorldError(f"demonstration of {task.name!r}: got {sorted(shown)}, expected an action, at least")
         image, state = _parts(shown, self._spec)
@@ -93,10 +121,10 @@ class Slot:
             return
         _, task, seed = self.outcome.episode
         try:
-            self.connect()
             self._see(self._ask({"do": "reset", "task": tasks[task].name, "seed": seed})[1])
         except WorldError as error:
             self._lose(error)
+            self.is_given_up = self.problem is not None
             return
         self.is_over = False
 
@@ -119,8 +147,15 @@ class Slot:
         self.is_over = header["ended"] or outcome.steps >= self._max_steps
 
     def _ask(self, request: dict[str, Any], **arrays: np.ndarray) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-        assert self._client is not None
-        return self._client.ask(request, **arrays)
+        """Asks the world, which is started if it is not there, and ended if it fails."""
+        self.start()
+        if self._client is None:
+            raise WorldError(self.problem)
+        try:
+            return self._client.ask(request, **arrays)
+        except WorldError:
+            self.close()
+            raise
 
     def _lose(self, error: WorldError) -> None:
         assert self.outcome is not None

@@ -14,46 +14,17 @@ import time
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from follower import WORLDS, Follower, alone, point_world
 from rich.console import Console
 
-from milx.config.assemble import make_config
-from milx.data import RECORDED
 from milx.data.dataset import Writer
-from milx.deploy.policy import Policy
 from milx.evaluation.intervals import wilson_interval
-from milx.methods.base import Method
 from milx.types import Demo, Spec
 from milx.worlds import report, summarize, worker
-from milx.worlds.actor import CONTROLS, other_tasks
+from milx.worlds.actor import CONTROLS
 from milx.worlds.client import Client, WorldError
 from milx.worlds.evaluate import evaluate_in
 from milx.worlds.slot import Episode, Outcome, Task
-
-WORLDS = pathlib.Path(__file__).parents[1] / "fixtures" / "worlds"
-sys.path.insert(0, str(WORLDS))
-import point_world  # noqa: E402
-
-
-class Follower(Method):
-    """Goes where a demonstration has ended, in steps of a fifth of the way that grow with every step."""
-
-    def init(self, key, whitening):
-        raise NotImplementedError
-
-    def loss(self, params, batch, progress=1.0):
-        raise NotImplementedError
-
-    def adapt(self, params, demo):
-        return demo.state[:, -1].mean(axis=0)
-
-    def unadapted(self, params):
-        return params["nowhere"]
-
-    def act(self, task_params, observation, memory):
-        return (task_params - observation.state) * jnp.minimum(0.2 + 0.1 * memory, 1.0), memory + 1
-
-    def initial_memory(self, key):
-        return jnp.zeros(())
 
 
 class Wide(Follower):
@@ -71,13 +42,6 @@ class Watcher(Follower):
         return jnp.stack([left, right]) / 1000 - 0.1, memory
 
 
-@pytest.fixture
-def policy():
-    config = make_config(RECORDED, preset="cpu")
-    config.recorded.path, config.recorded.horizon = "somewhere", 6
-    return Policy(Follower(), Spec(None, 2, 2, None, ()), {"nowhere": jnp.zeros(2)}, config)
-
-
 @pytest.fixture(autouse=True)
 def folder(monkeypatch):
     monkeypatch.chdir(WORLDS)
@@ -86,36 +50,15 @@ def folder(monkeypatch):
 TASKS = [Task(name, name.partition("/")[0]) for name in point_world.GOALS]
 
 
-def alone(task, seed, control, policy):
-    """Runs an episode without workers and batches; returns whether the task was done at any time, and at last."""
-    env, number = point_world.PointWorld(task.name), TASKS.index(task)
-    shown = point_world.PointWorld(task.name).demonstrate(99)
-    source = number if control not in ("same_family", "other_family") else other_tasks(TASKS, number)[control]
-    goal = point_world.PointWorld(TASKS[source].name).demonstrate(99)["state"][-1]
-    goal = np.zeros(2) if control == "unadapted" else goal
-    env.action_space.seed(seed)
-    position, _ = env.reset(seed=seed)
-    done = []
-    for step in range(point_world.LENGTH):
-        action = {
-            "replay": shown["action"][step],
-            "mean_action": shown["action"].mean(axis=0),
-            "random": env.action_space.sample(),
-        }.get(control, (goal - position) * min(0.2 + 0.1 * step, 1.0))
-        position, _, _, _, info = env.step(np.clip(action, -0.5, 0.5))
-        done.append(bool(info["is_success"]))
-    return any(done), done[-1]
-
-
 def test_episodes_end_as_they_do_one_after_the_other(policy):
     """Runs all controls in three worlds at once; every outcome is that of a loop in this process."""
     outcomes = evaluate_in(policy, "point_world:make", TASKS, episodes=3, seed=100, workers=3)
     assert len(outcomes) == len(TASKS) * len(CONTROLS) * 3
+    shown = [task._replace(demos=(Demo(),)) for task in TASKS]
     for outcome in outcomes:
-        control, task, seed = outcome.episode
         assert outcome.lost is None
         assert outcome.steps == point_world.LENGTH
-        assert (outcome.ever, outcome.end) == alone(TASKS[task], seed, control, policy), outcome.episode
+        assert (outcome.ever, outcome.end) == alone(shown, outcome.episode, demo_seed=99), outcome.episode
     rate = {name: np.mean([o.end for o in outcomes if o.episode.control == name]) for name in CONTROLS}
     assert rate["own"] == 1
     assert rate["replay"] > rate["other_family"] == rate["same_family"] == rate["unadapted"] == 0
@@ -304,6 +247,11 @@ def test_a_run_is_evaluated_in_the_world_whose_tasks_its_data_set_names(policy, 
     assert re.search(r"its own demonstration.* 100.0% \(68 to 100\)", console.file.getvalue())
 
 
+def in_words(successes, episodes):
+    low, high = wilson_interval(successes, episodes)
+    return f"{successes / episodes:.1%} ({100 * low:.0f} to {100 * high:.0f})"
+
+
 def test_lost_episodes_count_as_episodes_without_success():
     tasks = [Task("a", "[/one]"), Task("b", "two\x1b[31m")]
     outcomes = [
@@ -324,7 +272,20 @@ def test_lost_episodes_count_as_episodes_without_success():
     }
     console = Console(file=io.StringIO(), width=200)
     console.print(report.table(found))
-    assert "[/one]" in console.file.getvalue() and "two\\x1b[31m" in console.file.getvalue()
+    said = console.file.getvalue()
+    assert "[/one]" in said and "two\\x1b[31m" in said
+    line = next(line for line in said.splitlines() if CONTROLS["own"] in line)
+    assert [cell.strip() for cell in line.strip("│").split("│")] == [
+        CONTROLS["own"],
+        in_words(2, 3),
+        in_words(1, 3),
+        "3, 1 lost",
+        in_words(2, 2),
+        in_words(0, 1),
+    ]
+    narrow = Console(file=io.StringIO(), width=60)
+    narrow.print(report.table(found))
+    assert "…" not in narrow.file.getvalue()
     assert report.losses(outcomes, tasks) == ["b, own, seed 0: it has ended"]
 
 

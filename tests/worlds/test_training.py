@@ -1,24 +1,21 @@
 """A run on recorded demonstrations whose checkpoints are chosen by their success in a world."""
 
-import pathlib
-import sys
+import io
 
 import numpy as np
 import pytest
+from follower import WORLDS, interpreter, point_world
+from rich.console import Console
+from tiny import QUIET
 
 import milx
-from milx.core.checkpoint import Checkpoints
+from milx.core.checkpoint import UNVALIDATED, Checkpoints
 from milx.data.dataset import Writer
 from milx.training import recorded
 from milx.training.factory import make_run
 from milx.training.metrics import read_metrics
 from milx.types import Demo
 from milx.worlds import WorldError, evaluate_in, tasks_of
-
-WORLDS = pathlib.Path(__file__).parents[1] / "fixtures" / "worlds"
-sys.path.insert(0, str(WORLDS))
-import point_world  # noqa: E402
-from tiny import QUIET  # noqa: E402
 
 pytestmark = pytest.mark.slow
 
@@ -66,6 +63,41 @@ def test_a_world_that_cannot_be_started_ends_the_run_before_training(config, tmp
     with pytest.raises(WorldError, match="has no attribute 'no_such_function'"):
         run.train()
     assert not (tmp_path / "run" / "metrics.jsonl").exists()
+
+
+def test_a_validation_without_a_finished_episode_has_no_score_and_does_not_end_training(config, tmp_path):
+    """Lets no world start after the one that is tried before training, then any: the last checkpoint is validated."""
+    config.train.steps, folder = 400, tmp_path / "run"
+    once = f"mkdir {tmp_path}/taken || exit 7"
+    config.evaluation.gym_python = interpreter(tmp_path / "python", once)
+    console = Console(file=io.StringIO(), width=1000)
+    make_run(config, folder, console).train()
+    lines = read_metrics(folder / "metrics.jsonl")
+    assert [line["step"] for line in lines if "validation_score" in line] == [200, 400]
+    assert not any("validation_success" in line for line in lines)
+    checkpoints = Checkpoints(folder / "checkpoints", read_only=True)
+    assert checkpoints.latest == 400
+    assert checkpoints.score(400) == UNVALIDATED
+    said = console.file.getvalue()
+    reason = "the world could not be started in 3 attempts: point_world:make: has ended (exit code 7)"
+    assert said.count(f"milx: the validation in point_world:make failed: {reason}") == 2
+    assert "step 400: validation success unknown" in said
+    config.evaluation.gym_python = None
+    make_run(config, folder, QUIET).train()
+    (line,) = (line for line in read_metrics(folder / "metrics.jsonl") if "validation_success" in line)
+    assert line["step"] == 400
+    assert Checkpoints(folder / "checkpoints", read_only=True).score(400) == line["validation_success"] > 0
+
+
+def test_a_validation_that_loses_all_of_a_few_episodes_has_no_score(config, tmp_path):
+    """Acts in a world that does not tell success: there are too few episodes for that to be an error of its own."""
+    config.train.steps, config.evaluation.gym = 200, "point_world:make_pictured"
+    console = Console(file=io.StringIO(), width=1000)
+    make_run(config, tmp_path / "run", console).train()
+    assert Checkpoints(tmp_path / "run" / "checkpoints", read_only=True).score(200) == UNVALIDATED
+    said = console.file.getvalue()
+    assert "an episode was lost: point_world:make_pictured: " in said and "neither is_success nor success" in said
+    assert "step 200: validation success unknown" in said
 
 
 def test_a_policy_with_a_history_is_chosen_in_the_world_extended_and_started_from(config, tmp_path):

@@ -1,0 +1,9 @@
+"""What the tests of worlds share."""
+
+import pytest
+from follower import follower_policy
+
+
+@pytest.fixture
+def policy():
+    return follower_policy()
