@@ -4,11 +4,12 @@
     python experiments/benchmarks/everything.py --only=physics --only=render --runs=5
     python experiments/benchmarks/everything.py --only=meshes --mjcf=panda/robot.xml
 
-The result files hold the median of the runs and the value of every run, and are written again after each run, so that
-nothing is lost if a later one fails. `meshes` needs files of models, and is left out without them; on a CPU so is what
-takes too long there.
+The result files hold the median of the runs that worked and the value of each, and are written again after every run,
+so that nothing is lost if a later one fails. `meshes` needs files of models, and is left out without them; on a CPU so
+is what takes too long there.
 """
 
+import itertools
 import json
 import pathlib
 import statistics
@@ -26,6 +27,18 @@ BENCHMARKS = (*ON_CPUS, "meshes", "planning", "growth", "scaling", "compiling")
 """The scripts."""
 HERE = pathlib.Path(__file__).parent
 RESULTS = HERE.parent / "results" / "benchmarks"
+FLAGS = flags.FLAGS
+
+
+def define_flags(values: flags.FlagValues = FLAGS) -> None:
+    """Defines --out, --only, --runs and --mjcf."""
+    where = "Folder of the JSON files; the page is written for the default."
+    flags.DEFINE_string("out", str(RESULTS), where, flag_values=values)
+    which = "Which; default all (repeat the flag)."
+    flags.DEFINE_multi_enum("only", None, list(BENCHMARKS), which, flag_values=values)
+    flags.DEFINE_integer("runs", 3, "How often each is run.", lower_bound=1, flag_values=values)
+    models = "Files of models for `meshes` (repeat the flag)."
+    flags.DEFINE_multi_string("mjcf", None, models, flag_values=values)
 
 
 def merged(runs: list[dict[str, Any]]) -> dict[str, Any]:
@@ -47,17 +60,21 @@ def merged(runs: list[dict[str, Any]]) -> dict[str, Any]:
     return runs[-1] | {"rows": list(rows.values())}
 
 
-def run(name: str, arguments: list[str], folders: list[pathlib.Path], out: pathlib.Path) -> bool:
-    """Runs a benchmark into the last folder, merges what all folders hold into `out`, and tells if it worked."""
+def run(name: str, arguments: list[str], folder: pathlib.Path) -> bool:
+    """Runs a benchmark, which writes its files to a folder, and tells whether it worked."""
     began = time.perf_counter()
-    done = subprocess.run([sys.executable, str(HERE / f"{name}.py"), f"--out={folders[-1]}", *arguments])
-    print(f"{name}, run {len(folders)}: {time.perf_counter() - began:.0f} s, exit code {done.returncode}", flush=True)
-    out.mkdir(parents=True, exist_ok=True)
-    for path in folders[-1].glob("*.json"):
-        files = [folder / path.name for folder in folders]
-        merge = merged([json.loads(file.read_text()) for file in files if file.is_file()])
-        (out / path.name).write_text(json.dumps(merge, indent=1) + "\n")
+    done = subprocess.run([sys.executable, str(HERE / f"{name}.py"), f"--out={folder}", *arguments])
+    print(f"{name}: {time.perf_counter() - began:.0f} s, exit code {done.returncode}", flush=True)
     return not done.returncode
+
+
+def merge(folders: list[pathlib.Path], out: pathlib.Path) -> None:
+    """Merges the files of the same name in several folders."""
+    out.mkdir(parents=True, exist_ok=True)
+    for name in sorted({path.name for folder in folders for path in folder.glob("*.json")}):
+        files = [folder / name for folder in folders]
+        content = merged([json.loads(file.read_text()) for file in files if file.is_file()])
+        (out / name).write_text(json.dumps(content, indent=1) + "\n")
 
 
 def _all() -> tuple[str, ...]:
@@ -68,27 +85,28 @@ def _all() -> tuple[str, ...]:
 
 def main(_: list[str]) -> None:
     """Runs what was chosen, and says what failed."""
-    failed = []
-    names = [name for name in _ONLY.value or _all() if name != "meshes" or _MJCF.value]
+    out, failed = pathlib.Path(FLAGS.out).resolve(), []
+    if "meshes" in (FLAGS.only or ()) and not FLAGS.mjcf:
+        raise app.UsageError("--only=meshes: expected --mjcf, the files of models")
+    names = [name for name in FLAGS.only or _all() if name != "meshes" or FLAGS.mjcf]
+    worked: dict[str, list[pathlib.Path]] = {name: [] for name in names}
     with tempfile.TemporaryDirectory() as folder:
-        folders = {name: [pathlib.Path(folder, name, str(i)) for i in range(_RUNS.value)] for name in names}
-        for count in range(1, _RUNS.value + 1):
-            for name in names:
-                arguments = [f"--mjcf={path}" for path in _MJCF.value or () if name == "meshes"]
-                if not run(name, arguments, folders[name][:count], pathlib.Path(_OUT.value)):
-                    failed.append(f"{name}, run {count}")
-    if _OUT.value == str(RESULTS):
-        subprocess.run(
-            [sys.executable, str(HERE / "summary.py"), str(HERE.parents[1] / "docs/benchmarks.png")], check=True
-        )
+        for number, name in itertools.product(range(FLAGS.runs), names):
+            arguments = [f"--mjcf={path}" for path in FLAGS.mjcf or () if name == "meshes"]
+            here = pathlib.Path(folder, name, str(number))
+            if run(name, arguments, here):
+                worked[name].append(here)
+                merge(worked[name], out)
+            else:
+                failed.append(f"{name}, run {number + 1}")
+    if out == RESULTS.resolve():
+        chart = HERE.parents[1] / "docs" / "benchmarks.png"
+        subprocess.run([sys.executable, str(HERE / "summary.py"), str(chart)], check=True)
         subprocess.run([sys.executable, str(HERE.parent / "paper" / "pages.py")], check=True)
     if failed:
         sys.exit(f"everything: failed: {', '.join(failed)}")
 
 
 if __name__ == "__main__":
-    _OUT = flags.DEFINE_string("out", str(RESULTS), "Folder of the JSON files; the page is written for the default.")
-    _ONLY = flags.DEFINE_multi_enum("only", None, list(BENCHMARKS), "Which; default all (repeat the flag).")
-    _RUNS = flags.DEFINE_integer("runs", 3, "How often each is run.", lower_bound=1)
-    _MJCF = flags.DEFINE_multi_string("mjcf", None, "Files of models for `meshes` (repeat the flag).")
+    define_flags()
     app.run(main)

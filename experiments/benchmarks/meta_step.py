@@ -149,7 +149,7 @@ def measure_domain(name: str) -> None:
         kind = "bfloat16" if mixed else "float32"
         report.measure(f"milx, {kind}", "ms", functools.partial(gradient, mixed), f"{sizes}, called one by one")
         report.measure(
-            f"milx, {kind}, whole step with rendering",
+            f"whole step with rendering: milx, {kind}",
             "ms",
             functools.partial(workload.measure_step, variant(mixed), env),
             "in a scan",
@@ -168,7 +168,7 @@ def measure_domain(name: str) -> None:
             f"PyTorch, {mode}, {kind}", "ms", functools.partial(measure_torch, config, env, batch, mode, bf16)
         )
     least, note = floor_ms(config, env, tasks, frames)
-    report.add("roofline", least, "ms", note=note)
+    report.add("least time: roofline", least, "ms", note=note)
 
 
 def main(_: list[str]) -> None:

@@ -63,29 +63,25 @@ def questions(result: dict[str, Any]) -> list[Question]:
         if row["median"] is not None:
             groups.setdefault((row["name"].rpartition(": ")[0], row["unit"]), []).append(row)
     return [
-        Question(", ".join(filter(None, (result["benchmark"], question))), unit, result["hardware"], rows)
+        Question(", ".join(filter(None, (_title(result), question))), unit, result["hardware"], rows)
         for (question, unit), rows in groups.items()
     ]
 
 
-def advantages(ours: Row, peer: Row, unit: str) -> list[float]:
-    """Computes in each run by which factor milx is faster, or its cost lower, than a peer's.
-
-    Files of a single run have no "runs".
-    """
-    pairs = zip(ours.get("runs", [ours["median"]]), peer.get("runs", [peer["median"]]), strict=False)
-    both = [(mine, theirs) for mine, theirs in pairs if mine is not None and theirs is not None]
-    return [mine / theirs if is_rate(unit) else theirs / mine for mine, theirs in both]
+def factor(ours: float, theirs: float, unit: str) -> float:
+    """Computes by which factor milx is faster, or its cost lower, than a peer."""
+    return ours / theirs if is_rate(unit) else theirs / ours
 
 
 def _ratio(question: Question, row: Row) -> str:
-    """Formats by which factor milx is better: of the medians, and the lowest and the highest of the runs."""
+    """Formats that factor of the medians, and its lowest and highest value in a run in which both were measured."""
     ours = question.rival(row)
     if ours is None:
         return ""
-    (of_medians,) = advantages({"median": ours["median"]}, {"median": row["median"]}, question.unit)
-    runs = advantages(ours, row, question.unit)
-    return f"{of_medians:.3g}" + (f" ({min(runs):.3g} to {max(runs):.3g})" if len(runs) > 1 else "")
+    both = zip(ours.get("runs", ()), row.get("runs", ()), strict=True)
+    runs = [factor(*pair, question.unit) for pair in both if None not in pair]
+    spread = f" ({min(runs):.3g} to {max(runs):.3g})" if len(runs) > 1 else ""
+    return f"{factor(ours['median'], row['median'], question.unit):.3g}{spread}"
 
 
 def number(row: Row) -> str:
@@ -136,16 +132,14 @@ def draw(results: list[dict[str, Any]], path: pathlib.Path) -> None:
     """Draws a panel for each question in which milx has a peer, as bars from zero; peers are gray."""
     asked = itertools.chain.from_iterable(map(questions, results))
     drawn = [question for question in asked if any(map(question.rival, question.rows))]
-    if len(drawn) % 2:
-        drawn.append(Question("", "", "", []))
-    heights = [0.7 + 0.16 * max(len(a.rows), len(b.rows)) for a, b in zip(drawn[::2], drawn[1::2], strict=True)]
+    pairs = itertools.zip_longest(drawn[::2], drawn[1::2])
+    heights = [0.7 + 0.16 * max(len(question.rows) for question in pair if question) for pair in pairs]
     figure, axes = plt.subplots(
         len(heights), 2, figsize=(11, sum(heights)), height_ratios=heights, squeeze=False, layout="constrained"
     )
-    for axis, question in zip(axes.ravel(), drawn, strict=True):
-        if not question.rows:
-            axis.set_axis_off()
-            continue
+    if len(drawn) % 2:
+        axes[-1, -1].set_axis_off()
+    for axis, question in zip(axes.ravel(), drawn, strict=False):
         medians = [row["median"] for row in question.rows]
         ours = [_who(row).startswith("milx") for row in question.rows]
         bars = axis.barh(

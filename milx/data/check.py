@@ -7,6 +7,7 @@ from absl import app
 from rich.console import Console
 from rich.table import Table
 
+from milx.config.schema import GIVEN
 from milx.core.commands import command
 from milx.core.messages import printable
 from milx.data.dataset import LARGEST, DataSet, check_size
@@ -49,7 +50,7 @@ def _refusals(data: DataSet) -> list[str]:
         elif not any(sum(head.tasks[i].has_action) > 1 for i in head.of_split(split)):
             unless = ""
             if any(len(head.tasks[i].lengths) > 1 and any(head.tasks[i].has_action) for i in head.of_split(split)):
-                unless = " unless method.given is video+state or video"
+                unless = f" unless method.given is {' or '.join(GIVEN[1:])}"
             found.append(f"no {split} task with two demonstrations that show actions: training refuses this{unless}")
     for number, task in enumerate(head.tasks):
         if len(task.lengths) < 2:

@@ -186,8 +186,9 @@ def checked(episode: Episode, contents: Contents) -> Demo:
         if not (np.abs(value) <= LARGEST).all():
             step, index = np.argwhere(~(np.abs(value) <= LARGEST))[0].tolist()
             where = named_entry(field, index, getattr(contents, f"{field}_names"))
-            got = f"got {value[step, index]} at time step {step}, expected finite numbers of at most {LARGEST:.0e}"
-            raise ValueError(f"{where} of episode {episode.name}: {got} (--skip_bad leaves it out)")
+            got = f"got {value[step, index]} at time step {step}, expected finite numbers"
+            most = f"of magnitude at most {LARGEST:.0e} (--skip_bad leaves it out)"
+            raise ValueError(f"{where} of episode {episode.name}: {got} {most}")
     return Demo(cameras.fitted(demo.image, contents.image_shape), **vectors)
 
 

@@ -9,7 +9,6 @@ belongs to, by names such as "lift/demo_0", the file without its suffix and the 
 import contextlib
 import functools
 import json
-import math
 import pathlib
 import re
 from collections.abc import Iterator
@@ -26,6 +25,8 @@ from milx.data.dataset import check_size
 from milx.data.episodes import Contents, Episode
 from milx.data.mapping import lookup, read_mapping
 from milx.types import Demo, by_field
+
+_MOST_FPS = 10_000
 
 
 class Robomimic:
@@ -58,7 +59,11 @@ class Robomimic:
             image_shape = cameras.joined({name: shape(key) for name, key in self.cameras.items()})
             sizes = {name: _dataset(file, f"{lead}/{name}", 2).shape[1] for name in self.state}
             actions = _dataset(file, f"data/{demo}/{action}", 2).shape[1] if action else 0
-            fps = _fps(file)
+        rates = set[float | None]()
+        for path in self.files:
+            with _open(path) as file:
+                rates.add(_fps(file))
+        fps = rates.pop() if len(rates) == 1 else None
         names = tuple(f"{name}.{i}" for name, size in sizes.items() for i in range(size))
         self.contents = Contents(image_shape, len(names), actions, fps, state_names=names)
 
@@ -139,7 +144,8 @@ def _fps(file: Any) -> float | None:
         found = json.loads(file["data"].attrs["env_args"])["env_kwargs"]["control_freq"]
     except (KeyError, TypeError, ValueError, RecursionError):
         return None
-    return float(found) if isinstance(found, int | float) and 0 < found < math.inf else None
+    is_number = isinstance(found, int | float) and not isinstance(found, bool)
+    return float(found) if is_number and 0 < found < _MOST_FPS else None
 
 
 def _demos(file: Any) -> list[str]:

@@ -108,7 +108,7 @@ def read_vectors(data: DataSet, tasks: list[int], horizon: int, chunk: int = 1, 
             for field, value in (("state", demo.state), ("action", demo.action)):
                 if value is not None and not (np.abs(value) <= LARGEST).all():
                     where = f"demonstration {number} of task {task} ({info.name!r})"
-                    expected = f"finite ones of at most {LARGEST:.0e}"
+                    expected = f"finite ones of magnitude at most {LARGEST:.0e}"
                     raise ValueError(
                         f"data: {field} of {where}: got values that are not finite or too large, expected {expected}"
                     )
@@ -151,9 +151,8 @@ class RecordedRun(Run):
                 )
         tasks = [i for i in self.data.header.of_split("train") if self._enough(i, train.shots)]
         if not tasks:
-            expected = (
-                f"at least one with more than train.shots = {train.shots} demonstrations, of which one shows actions"
-            )
+            of_actions = "that show actions" if self.given_action else "of which one shows actions"
+            expected = f"at least one with more than train.shots = {train.shots} demonstrations {of_actions}"
             raise ValueError(f"data: {config.recorded.path} has no such training task, expected {expected}")
         self.shards = Shards(
             self.data,
@@ -230,7 +229,8 @@ class RecordedRun(Run):
     def _success(self, params: Params, make: str) -> float | None:
         """Computes how often a policy is successful in the world of the validation tasks, at any time.
 
-        Episodes that are lost are reported; None if all are.
+        Episodes that are lost are reported. Those lost before their first step say nothing of the policy; None if all
+        are.
         """
         policy, evaluation = Policy(self.method, self.spec, params, self.config), self.config.evaluation
         try:
@@ -249,9 +249,8 @@ class RecordedRun(Run):
             return None
         for loss in {outcome.lost for outcome in outcomes if outcome.lost}:
             self._warn(f"an episode was lost: {loss}")
-        if all(outcome.lost for outcome in outcomes):
-            return None
-        return float(np.mean([outcome.ever for outcome in outcomes]))
+        begun = [outcome.ever for outcome in outcomes if outcome.steps]
+        return float(np.mean(begun)) if begun else None
 
     def _judge(self, params: Params) -> tuple[dict[str, Any], Callable[[dict[str, Any]], None]]:
         with self.clock("evaluate"), self.phase("evaluating the policy"):

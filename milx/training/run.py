@@ -90,7 +90,7 @@ class Run(abc.ABC):
         self.method = methods.make(config, spec)
         self.trainer = Trainer(sample, self.method, config.train, make_optimizer(config.optimizer, config.train.steps))
         self.clock = loop.Clock()
-        if config.train.init is not None and not self._checkpoints.is_dir():
+        if config.train.init is not None and not any(path.name.isdigit() for path in self._checkpoints.glob("*")):
             check_source(config.train.init, self._params_like, config)  # what it refuses leaves the folder free
         self._claim_folder()
 

@@ -23,8 +23,8 @@ from milx.types import Array, Params
 
 FILES = (".safetensors", ".npz")
 """The endings of files with parameters."""
-_CONVOLUTIONS = ("recorded.history", "network.filters", "network.kernel", "network.strides")
-"""The fields of a configuration on which the shapes of convolutions' kernels depend, and their strides."""
+_CONVOLUTIONS = ("recorded.history", "network.residual_blocks", "network.filters", "network.kernel")
+"""The fields of a configuration on which the names and shapes of convolutions' kernels depend."""
 _DENSE = ("network.fc_layers",)
 """Those on which the shapes of fully connected layers' kernels depend."""
 
@@ -104,8 +104,10 @@ def _differences(theirs: Config, config: Config, fields: tuple[str, ...]) -> str
 
     Where none does, the sizes of states and actions are the cause.
     """
-    mine, other = assemble.fields(config), assemble.fields(theirs).items()
-    differing = [f"{name}={value}" for name, value in other if name in fields and value != mine.get(name)]
+    mine, other = assemble.fields(config), assemble.fields(theirs)
+    if fields == _CONVOLUTIONS and len(mine["network.filters"]) != len(other["network.filters"]):
+        fields = (*fields, "network.strides")  # one for each convolution
+    differing = [f"{name}={value}" for name, value in other.items() if name in fields and value != mine.get(name)]
     return ", ".join(differing) or "states and actions of the same sizes"
 
 

@@ -59,7 +59,7 @@ def evaluate_in(
     """Runs episodes of every task with the policy and with controls.
 
     A world that fails costs its episode, and is started anew for the next one. One that cannot be started, even in
-    several attempts, costs the episode that it would have run, and the other worlds run the rest.
+    several attempts, gets no more of them, and the other worlds run the rest.
 
     Args:
         policy: what is evaluated.
@@ -81,7 +81,8 @@ def evaluate_in(
         failed to demonstrate are lost.
 
     Raises:
-        WorldError: if no world can be started, no task can be demonstrated, or all of the first episodes are lost.
+        WorldError: if no world can be started, no task can be demonstrated, or all of the first episodes, or all there
+            are, are lost.
         ValueError: if there is no task, or for a control that does not exist.
     """
     if not tasks:
@@ -123,11 +124,16 @@ def _demonstrated(slots: list[Slot], tasks: Sequence[Task], seed: int) -> tuple[
     """
     shown, missing = list(tasks), dict[int, str]()
     for number, task in enumerate(tasks):
-        slot = next((slot for slot in slots if slot.problem is None), slots[0])
-        try:
-            shown[number] = slot.demonstrated(task, seed)
-        except WorldError as error:
-            missing[number] = f"the task has no demonstration: {error}"
+        for slot in slots:
+            try:
+                shown[number] = slot.demonstrated(task, seed)
+            except WorldError as error:
+                missing[number] = f"the task has no demonstration: {error}"
+                if slot.problem is not None:  # another world may be there
+                    continue
+            else:
+                missing.pop(number, None)
+            break
     if len(missing) == len(tasks):
         raise WorldError(missing[0])
     return shown, missing
@@ -136,20 +142,24 @@ def _demonstrated(slots: list[Slot], tasks: Sequence[Task], seed: int) -> tuple[
 def _run(
     pool: ThreadPoolExecutor, slots: list[Slot], actor: Actor, tasks: Sequence[Task], outcomes: list[Outcome]
 ) -> None:
-    """Runs the episodes of `outcomes`, as many at once as there are slots; if all are given up, the rest is lost.
+    """Runs the episodes of `outcomes`, as many at once as there are slots; if no world is left, the rest is lost.
 
     Raises:
-        WorldError: if all of the first ones, at least ten, are lost.
+        WorldError: if all of the first ones, at least ten, are lost, or all there are because no world is left.
     """
     waiting, ended = collections.deque(outcomes), list[Outcome]()
     while len(ended) < len(outcomes):
+        if waiting:
+            list(pool.map(Slot.start, slots))
         for number, slot in enumerate(slots):
-            if slot.outcome is None and waiting and not slot.is_given_up:
+            if slot.outcome is None and waiting and slot.problem is None:
                 slot.outcome = waiting.popleft()
                 actor.assign(number, slot.outcome.episode)
-        if all(slot.is_given_up for slot in slots):
+        if all(slot.problem for slot in slots):
             for outcome in waiting:
                 outcome.lost = slots[0].problem
+            if all(outcome.lost for outcome in outcomes):
+                raise WorldError(f"all {len(outcomes)} episodes were lost: {outcomes[0].lost}")
             return
         list(pool.map(lambda slot: slot.begin(tasks), slots))
         actions = actor.act([slot.observation for slot in slots], [slot.outcome for slot in slots])

@@ -69,7 +69,6 @@ class Slot:
 
     Attributes:
         problem: why the world cannot be started; None if it can, as far as is known.
-        is_given_up: whether an episode has been lost because the world cannot be started: it gets no other one.
         outcome: of the episode that is to begin or under way; None if there is none.
         is_over: whether no episode is under way.
         observation: what was seen last.
@@ -79,7 +78,6 @@ class Slot:
         self._connect, self._spec, self._max_steps = connect, spec, max_steps
         self._client: Client | None = None
         self.problem: str | None = None
-        self.is_given_up = False
         self.outcome: Outcome | None = None
         self.is_over = True
         self.observation = _nothing(spec)
@@ -96,7 +94,11 @@ class Slot:
                     self.problem = f"the world could not be started in {_STARTS} attempts: {error}"
 
     def close(self) -> None:
-        """Ends the world."""
+        """Ends the world, which is not started again."""
+        self.problem = self.problem or "the evaluation has ended"
+        self._end()
+
+    def _end(self) -> None:
         if self._client is not None:
             self._client.close()
         self._client = None
@@ -124,7 +126,6 @@ class Slot:
             self._see(self._ask({"do": "reset", "task": tasks[task].name, "seed": seed})[1])
         except WorldError as error:
             self._lose(error)
-            self.is_given_up = self.problem is not None
             return
         self.is_over = False
 
@@ -154,13 +155,13 @@ class Slot:
         try:
             return self._client.ask(request, **arrays)
         except WorldError:
-            self.close()
+            self._end()
             raise
 
     def _lose(self, error: WorldError) -> None:
         assert self.outcome is not None
         self.outcome.lost, self.outcome.ever, self.outcome.end = str(error), False, False
-        self.close()
+        self._end()
         self.is_over = True
 
     def _see(self, arrays: dict[str, np.ndarray]) -> None:

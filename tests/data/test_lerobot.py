@@ -134,7 +134,7 @@ def test_some_episodes_are_selected_and_bad_ones_left_out(copy, capsys):
     named = contents._replace(action_names=tuple(f"motor {i}" for i in range(contents.action_size)))
     for value, got in ((1e300, "inf"), (-1e20, r"-1\.0\d+e\+20")):
         broken.action[7, 1] = value
-        message = rf"action\[1\] \(motor 1\) of episode 1: got {got} at time step 7, expected finite numbers of at most"
+        message = rf"action\[1\] \(motor 1\) of episode 1: got {got} at time step 7, expected .* at most 1e\+12"
         with pytest.raises(ValueError, match=message):
             episodes.write(copy / "out", found, named, (0.3, 0.3), "there")
         assert not (copy / "out").exists()
@@ -145,23 +145,13 @@ def test_some_episodes_are_selected_and_bad_ones_left_out(copy, capsys):
 
 
 @pytest.mark.parametrize("module", ["milx.data.lerobot", "milx.data.robomimic", "milx.worlds.record"])
-def test_help_lists_every_flag(module):
+def test_help_lists_the_flags_of_all_importers_and_recorders(module):
     said = subprocess.run([sys.executable, "-m", module, "--help"], capture_output=True, text=True, timeout=60).stdout
-    shared = ("height", "validation", "test", "family", "splits")
-    own = (
-        ("demos", "python", "workers")
-        if module == "milx.worlds.record"
-        else (
-            "camera",
-            "state",
-            "action",
-            "task",
-            "classes",
-            "episodes",
-            "skip_bad",
-        )
+    own = {"milx.worlds.record": "demos python workers timeout"}
+    flags = (
+        own.get(module, "camera state action task classes episodes skip_bad") + " height validation test family splits"
     )
-    for flag in (*shared, *own):
+    for flag in flags.split():
         assert re.search(rf"^\s*--(\[no\])?{flag}:", said, re.MULTILINE), flag
 
 

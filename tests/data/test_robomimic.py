@@ -83,11 +83,23 @@ def test_several_cameras_and_the_control_frequency_are_kept(copy, tmp_path):
         np.testing.assert_array_equal(image["agentview"], other.read().image)
 
 
-@pytest.mark.parametrize("args", ["{}", "[", '{"env_kwargs": 3}', '{"env_kwargs": {"control_freq": "20"}}'])
-def test_files_that_do_not_say_how_fast_they_are_have_no_rate(copy, args):
-    with h5py.File(copy, "a") as file:
-        file["data"].attrs["env_args"] = args
+def say_rate(path, rate):
+    with h5py.File(path, "a") as file:
+        file["data"].attrs["env_args"] = f'{{"env_kwargs": {{"control_freq": {rate}}}}}'
+
+
+@pytest.mark.parametrize("rate", ["", "3]", '"20"', "true", "0", "1e6", "1" + 400 * "0", "[20]"])
+def test_files_that_do_not_say_how_fast_they_are_have_no_rate(copy, rate):
+    say_rate(copy, rate)
     assert open_set(copy).contents.fps is None
+
+
+def test_files_of_different_rates_have_none_in_common(copy):
+    say_rate(copy, 20)
+    other = shutil.copy(copy, copy.parent / "stack.hdf5")
+    assert open_set(copy.parent).contents.fps == 20
+    say_rate(other, 10)
+    assert open_set(copy.parent).contents.fps is None
 
 
 def replace(path, name, value):

@@ -5,6 +5,7 @@ import pathlib
 import sys
 
 import pytest
+from absl import app, flags
 
 sys.path.insert(0, str(pathlib.Path(__file__).parents[2] / "experiments" / "benchmarks"))
 import everything
@@ -15,22 +16,40 @@ import json, pathlib, sys
 folder = pathlib.Path(sys.argv[1].removeprefix("--out="))
 run = int(folder.name)
 folder.mkdir(parents=True)
-rows = [{"name": "milx", "median": [3.0, 1.0, 2.0][run], "unit": "ms", "peak_memory_gib": run + 0.5}]
-rows += [{"name": "peer", "median": None if run == 1 else 6.0, "unit": "ms", "peak_memory_gib": None}]
-(folder / "slow.json").write_text(json.dumps({"benchmark": "slow", "rows": rows[:1] if run == 2 else rows}))
-sys.exit(3 if run == 1 else 0)
+rows = [{"name": "milx", "median": [3.0, 9.0, 1.0, 2.0][run], "unit": "ms", "peak_memory_gib": run + 0.5}]
+rows += [{"name": "peer", "median": None if run == 2 else 6.0, "unit": "ms", "peak_memory_gib": None}]
+(folder / "slow.json").write_text(json.dumps({"benchmark": "slow", "rows": rows[:1] if run == 3 else rows}))
+sys.exit(4 if run == 1 else 0)
 """
 
 
-def test_runs_are_merged_and_those_that_fail_are_told(tmp_path, monkeypatch):
-    (tmp_path / "slow.py").write_text(SCRIPT)
+@pytest.fixture
+def run_everything(tmp_path, monkeypatch):
+    """Returns a function that runs the launcher, with SCRIPT as the benchmark "physics"."""
+    (tmp_path / "physics.py").write_text(SCRIPT)
     monkeypatch.setattr(everything, "HERE", tmp_path)
-    folders = [tmp_path / "runs" / str(i) for i in range(3)]
-    worked = [everything.run("slow", [], folders[: i + 1], tmp_path / "out") for i in range(3)]
-    assert worked == [True, False, True]
+    values = flags.FlagValues()
+    everything.define_flags(values)
+    monkeypatch.setattr(everything, "FLAGS", values)
+
+    def run(*arguments):
+        values(["everything", f"--out={tmp_path / 'out'}", *arguments])
+        everything.main([])
+
+    return run
+
+
+def test_runs_that_worked_are_merged_and_the_others_are_told(run_everything, tmp_path):
+    with pytest.raises(SystemExit, match=r"everything: failed: physics, run 2$"):
+        run_everything("--only=physics", "--runs=4")
     ours, peer = json.loads((tmp_path / "out" / "slow.json").read_text())["rows"]
-    assert (ours["median"], ours["runs"], ours["peak_memory_gib"]) == (2.0, [3.0, 1.0, 2.0], 2.5)
+    assert (ours["median"], ours["runs"], ours["peak_memory_gib"]) == (2.0, [3.0, 1.0, 2.0], 3.5)
     assert (peer["median"], peer["runs"], peer["peak_memory_gib"]) == (6.0, [6.0, None, None], None)
+
+
+def test_meshes_need_models(run_everything):
+    with pytest.raises(app.UsageError, match="--only=meshes: expected --mjcf"):
+        run_everything("--only=physics", "--only=meshes")
 
 
 def row(name, *runs, unit="ms"):
@@ -39,8 +58,8 @@ def row(name, *runs, unit="ms"):
 
 @pytest.mark.parametrize(("unit", "fast", "slow"), [("ms", 2.0, 6.0), ("", 2.0, 6.0), ("frames/s", 6.0, 2.0)])
 def test_milx_is_better_by_as_much_as_it_is_faster(unit, fast, slow):
-    assert summary.advantages(row("milx", fast), row("peer", slow), unit) == [3.0]
-    assert summary.advantages(row("milx", slow), row("peer", fast), unit) == [pytest.approx(1 / 3)]
+    assert summary.factor(fast, slow, unit) == 3.0
+    assert summary.factor(slow, fast, unit) == pytest.approx(1 / 3)
 
 
 def test_the_spread_is_that_of_the_ratios_in_the_same_run():
@@ -75,3 +94,16 @@ def test_a_peer_is_compared_with_what_answers_the_same_question_at_the_same_prec
         "other: peer, float32": None,
         "case: peer, float32, rate": None,
     }
+
+
+@pytest.mark.parametrize("peers", [1, 2])
+def test_a_panel_is_drawn_for_each_question_that_has_a_peer(tmp_path, peers, monkeypatch):
+    """Reads the panels back before they are closed."""
+    rows = [row(f"{case}: {who}", 2.0) for case in "ab"[:peers] for who in ("milx", "peer")] + [row("c: milx", 1.0)]
+    drawn = []
+    monkeypatch.setattr(summary.plt, "close", drawn.append)
+    summary.draw([{"benchmark": "speed", "hardware": "1 x x86_64", "rows": rows}], tmp_path / "chart.png")
+    panels = [axis for axis in drawn[0].axes if axis.axison]
+    expected = [f"speed-cpu, {case}\nms, less is better, 1 x x86_64" for case in "ab"[:peers]]
+    assert [axis.get_title() for axis in panels] == expected
+    assert [[bar.get_width() for bar in axis.patches] for axis in panels] == [[2.0, 2.0]] * peers

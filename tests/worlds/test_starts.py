@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 from follower import WORLDS, alone, interpreter
 
-from milx.types import Demo
+from milx.types import Demo, Spec
+from milx.worlds import evaluate
 from milx.worlds.actor import CONTROLS
 from milx.worlds.client import WorldError
 from milx.worlds.evaluate import evaluate_in
-from milx.worlds.slot import Episode, Task
+from milx.worlds.slot import Episode, Slot, Task
 
 SHOWN = (Demo(state=np.ones((6, 2)), action=np.zeros((6, 2))),)
 TASK = Task("near/right", "near", SHOWN)
@@ -35,25 +36,11 @@ def test_a_world_that_fails_to_start_is_tried_again(policy, tmp_path):
     assert (tmp_path / "b").exists()
 
 
-def test_a_world_that_cannot_be_started_costs_one_episode_and_is_reported(policy, tmp_path):
-    """Lets one of three worlds start, which runs all episodes but one for each of the others."""
-    outcomes = evaluate_in(
-        policy,
-        "point_world:make",
-        [TASK],
-        controls=["own"],
-        episodes=8,
-        workers=3,
-        python=starting_once(tmp_path),
-    )
-    lost = [outcome for outcome in outcomes if outcome.lost is not None]
-    assert len(lost) == 2
-    for outcome in lost:
-        assert not outcome.end and outcome.steps == 0
-        assert outcome.lost.startswith(
-            "the world could not be started in 3 attempts: point_world:make: has ended (exit code 7)"
-        )
-    assert all(outcome.end for outcome in outcomes if outcome.lost is None)
+def test_a_world_that_cannot_be_started_leaves_its_episodes_to_the_others(policy, tmp_path):
+    """Lets one of three worlds start, which runs all episodes."""
+    python = starting_once(tmp_path)
+    outcomes = evaluate_in(policy, "point_world:make", [TASK], controls=["own"], episodes=8, workers=3, python=python)
+    assert [(outcome.lost, outcome.end) for outcome in outcomes] == [(None, True)] * 8
     assert len((tmp_path / "starts").read_text().split()) == 1 + 2 * 3, "attempts"
 
 
@@ -83,6 +70,54 @@ def test_what_was_done_is_kept_when_no_world_can_be_started_again(policy, tmp_pa
     for outcome in outcomes[2:]:
         assert outcome.lost.startswith("the world could not be started in 3 attempts: point_world:make_frail: ")
     assert len((tmp_path / "starts").read_text().split()) == 1 + 3, "attempts"
+
+
+def test_episodes_of_which_none_has_begun_are_an_error(policy, tmp_path):
+    """Ends the only world in its first reset, and lets no other one start."""
+    python = starting_once(tmp_path)
+    with pytest.raises(WorldError, match=r"all 4 episodes were lost: .*has ended \(exit code 7\)"):
+        evaluate_in(
+            policy, "point_world:make_frail", [TASK], controls=["own"], episodes=4, seed=1, workers=1, python=python
+        )
+
+
+class Dying:
+    """A world that ends when it is asked, and cannot be started again."""
+
+    def __init__(self):
+        self.started = False
+
+    def connect(self):
+        if self.started:
+            raise WorldError("no more")
+        self.started = True
+        return self
+
+    def ask(self, request):
+        raise WorldError("has ended")
+
+    def close(self):
+        pass
+
+
+class Showing:
+    """A world that shows every task."""
+
+    def ask(self, request):
+        return {}, {"state": np.ones((6, 2)), "action": np.zeros((6, 2))}
+
+    def close(self):
+        pass
+
+
+def test_another_world_shows_what_comes_after_the_task_in_whose_demonstration_one_has_ended():
+    tasks, spec = [Task(name) for name in ("a", "b", "c")], Spec(None, 2, 2, None, ())
+    slots = [Slot(connect, spec, 6) for connect in (Dying().connect, Showing)]
+    shown, missing = evaluate._demonstrated(slots, tasks, 0)
+    assert missing == {0: "the task has no demonstration: has ended"}
+    assert [len(task.demos) for task in shown] == [0, 1, 1]
+    with pytest.raises(WorldError, match="the task has no demonstration: has ended"):
+        evaluate._demonstrated([Slot(Dying().connect, spec, 6)], tasks, 0)
 
 
 def test_a_task_that_the_world_fails_to_demonstrate_costs_its_own_episodes(policy):
