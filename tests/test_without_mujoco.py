@@ -6,7 +6,11 @@ import pathlib
 import subprocess
 import sys
 
+import numpy as np
 import pytest
+
+from milx.data.dataset import Writer
+from milx.types import SPLITS, Demo
 
 FAILURES = pathlib.Path(__file__).parents[1] / "experiments" / "robustness"
 sys.path.insert(0, str(FAILURES))
@@ -70,6 +74,33 @@ start_from("push", methods.params_like(methods.make(config, spec), spec), config
     done = run(program)
     assert done.returncode == 0, done.stderr[-2000:]
     assert done.stdout == "milx: 47 of 50 parameters start from push; all others are drawn\n"
+
+
+def test_the_check_and_success_in_a_world_need_none(tmp_path):
+    rng = np.random.default_rng(0)
+    with Writer(tmp_path / "set", None, 2, 2) as writer:
+        for split in SPLITS:
+            writer.add(split, split, [5, 5], [Demo(None, *rng.normal(size=(2, 5, 2))) for _ in range(2)])
+    program = f"""
+sys.path.insert(0, {str(pathlib.Path(__file__).parent / "worlds")!r})
+import os
+import numpy as np
+from follower import WORLDS, follower_policy
+from milx.data import check
+from milx.types import Demo
+from milx.worlds.evaluate import evaluate_in
+from milx.worlds.slot import Task
+
+check.main(["check", sys.argv[1]])
+os.chdir(WORLDS)
+task = Task("near/right", "near", (Demo(state=np.ones((6, 2)), action=np.zeros((6, 2))),))
+outcomes = evaluate_in(follower_policy(), "point_world:make", [task], controls=["own"], episodes=2, workers=1)
+print([outcome.end for outcome in outcomes])
+"""
+    done = run(program, tmp_path / "set")
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert "3 tasks, 6 demonstrations" in done.stdout
+    assert done.stdout.splitlines()[-1] == "[True, True]"
 
 
 @pytest.mark.slow

@@ -32,20 +32,18 @@ class Batched:
         self._learned: tuple[TaskParams, ...] = ()
         self._memories: list[Memory] = []
 
-    def demonstrate(self, demo: Demo) -> None:
-        """Adapts to a task, and begins new episodes.
+    def reset(self, demo: Demo | None = None) -> None:
+        """Begins new episodes: what was remembered of all environments is forgotten.
 
         Args:
-            demo: one demonstration [T, ...] or several [K, T, ...].
+            demo: one demonstration [T, ...] or several [K, T, ...] of the task of these and the following episodes;
+                None if it is the same task as before.
 
         Raises:
             ValueError: as `adapt` of the policy, for a field that is missing or has a wrong shape, type or value.
         """
-        self._learned = (self._adapt(demo),)
-        self.reset()
-
-    def reset(self) -> None:
-        """Begins new episodes of the same task: what was remembered of all environments is forgotten."""
+        if demo is not None:
+            self._learned = (self._adapt(demo),)
         self._memories = []
 
     def act(self, batch: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -59,7 +57,7 @@ class Batched:
                 `reset`, or, as `observations` and `step` of the policy, for what an environment shows.
         """
         if not self._learned:
-            raise ValueError("demo: missing, expected a call of `demonstrate` before the first action")
+            raise ValueError("demo: missing, expected a call of `reset` with one before the first action")
         seen = observations(batch, self._fields)
         memories = self._memories or [self._policy.initial_memory] * len(seen)
         if len(seen) != len(memories):

@@ -1,7 +1,7 @@
 """A policy that LeRobot's evaluation loop can call, after one demonstration of the task.
 
     policy = LeRobotPolicy(milx.load("runs/demos"))
-    policy.demonstrate(demo)
+    policy.reset(demo)
     info = lerobot.scripts.lerobot_eval.eval_policy(worlds, policy, ..., n_episodes=50)
 
 This module needs LeRobot, which brings PyTorch; no other module of milx imports them.
@@ -64,20 +64,17 @@ class LeRobotPolicy(PreTrainedPolicy):
         super().__init__(LeRobotConfig())
         self._batched = Batched(policy)
 
-    def demonstrate(self, demo: Demo) -> None:
-        """Adapts to the task of the episodes that follow, until the next demonstration.
+    def reset(self, demo: Demo | None = None) -> None:
+        """Begins new episodes; LeRobot does so without a demonstration before every batch of episodes.
 
         Args:
-            demo: one demonstration [T, ...] or several [K, T, ...].
+            demo: one demonstration [T, ...] or several [K, T, ...] of the task of these and the following episodes;
+                None if it is the same task as before.
 
         Raises:
             ValueError: for a field that is missing or has a wrong shape, type or value.
         """
-        self._batched.demonstrate(demo)
-
-    def reset(self) -> None:
-        """Begins new episodes of the task that was demonstrated; LeRobot does so before every batch of episodes."""
-        self._batched.reset()
+        self._batched.reset(demo)
 
     def select_action(self, batch: dict[str, Any]) -> torch.Tensor:
         """Returns the actions, a tensor [B, A] on the CPU, for one time step of B environments.

@@ -34,11 +34,12 @@ _ATTEMPTS = 2
 
 
 class Recorded(NamedTuple):
-    """The demonstrations of a task, [T, ...] each, and why there are not more of them."""
+    """The demonstrations of a task, [T, ...] each, why there are not more of them, and their time steps in a second."""
 
     task: str
     demos: list[Demo]
     problem: str
+    fps: float | None = None
 
 
 def record(connect: Callable[[], Client], tasks: Sequence[str], demos: int, workers: int) -> Iterator[Recorded]:
@@ -58,22 +59,23 @@ def record(connect: Callable[[], Client], tasks: Sequence[str], demos: int, work
         idle.put(None)
 
     def show(task: str) -> Recorded:
-        client, shown, problem = idle.get(), list[Demo](), ""
+        client, shown, problem, fps = idle.get(), list[Demo](), "", None
         try:
             for seed in range(_ATTEMPTS * demos):
                 if len(shown) == demos:
                     break
                 try:
                     client = client or connect()
-                    _, arrays = client.ask({"do": "demonstrate", "task": task, "seed": seed})
+                    header, arrays = client.ask({"do": "demonstrate", "task": task, "seed": seed})
                     shown.append(_demo(task, arrays))
+                    fps = header.get("fps")
                 except WorldError as error:
                     if client is not None:
                         client.close()
                     client, problem = None, str(error)
         finally:  # whatever happens, `record` waits for all of them at its end
             idle.put(client)
-        return Recorded(task, shown, problem)
+        return Recorded(task, shown, problem, fps)
 
     waiting, under_way = collections.deque(tasks), collections.deque[Future[Recorded]]()
     try:
@@ -101,7 +103,7 @@ def write(
 
     Args:
         out: the folder; must not exist.
-        recorded: the results of `record`.
+        recorded: the results of `record`; the first one's rate is that of the data set.
         split_of: the split of every task.
         families: the family of every task.
         demos: demonstrations that a task needs.
@@ -118,8 +120,8 @@ def write(
     image, state, action = (getattr(first.demos[0], field) for field in ("image", "state", "action"))
     shape = from_fields({name: shrunk(each.shape[1:3], height) for name, each in by_field(image).items()})
     sizes = shape, 0 if state is None else state.shape[1], action.shape[1]
-    with Writer(out, *sizes, source) as writer:
-        for task, shown, _ in itertools.chain([first], kept):
+    with Writer(out, *sizes, source, first.fps) as writer:
+        for task, shown, *_ in itertools.chain([first], kept):
             fitting = [Demo(fitted(demo.image, shape), demo.state, demo.action) for demo in shown]
             writer.add(task, split_of[task], [len(demo.action) for demo in shown], fitting, families[task])
 

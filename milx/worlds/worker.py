@@ -9,7 +9,8 @@ dictionaries with "image", uint8 [H, W, 3], or "state", real numbers [S], or bot
 `info["is_success"]`, or else `info["success"]`, tells after every step whether the task is done. Actions are those of a
 `gymnasium.spaces.Box`, to whose limits they are clipped. An environment may have a method `demonstrate(seed)`, which
 returns a demonstration as a dictionary with the arrays "image", "state" and "action", [T, ...], and raises an error if
-it fails. The module may have a function `tasks()`, which lists the names of all tasks.
+it fails, and a `metadata["render_fps"]`, its time steps in a second. The module may have a function `tasks()`, which
+lists the names of all tasks.
 
 The process reads requests from standard input and writes a reply to each to standard output. Both are messages: four
 bytes, little-endian, hold the length of a JSON object; the object follows, and then the bytes of the arrays that its
@@ -20,7 +21,7 @@ bytes, little-endian, hold the length of a JSON object; the object follows, and 
 | when the process starts | | {"protocol": 1} | |
 | {"do": "reset", "task": NAME, "seed": NUMBER} | | {} | the observation |
 | {"do": "step"} | "action" [A]; none for a random one | {"success": BOOL, "ended": BOOL} | the observation |
-| {"do": "demonstrate", "task": NAME, "seed": NUMBER} | | {} | the demonstration; none if the world shows none |
+| {"do": "demonstrate", "task": NAME, "seed": NUMBER} | | {"fps": NUMBER or null} | the demonstration, or nothing |
 | {"do": "tasks"} | | {"tasks": [NAME, ...]} | |
 
 A reply {"error": TEXT} says what went wrong. The process ends when its input ends.
@@ -95,9 +96,10 @@ class World:
     def demonstrate(self, task, seed):
         """Shows the task, if the environment can."""
         env = self._of(task)
+        fps = getattr(env, "metadata", {}).get("render_fps")
         while env is not None and not hasattr(type(env), "demonstrate"):
             env = getattr(env, "env", None)
-        return {}, {} if env is None else _by_field(env.demonstrate(seed))
+        return {"fps": float(fps) if fps else None}, {} if env is None else _by_field(env.demonstrate(seed))
 
     def tasks(self):
         """Lists the tasks."""

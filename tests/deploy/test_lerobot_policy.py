@@ -145,9 +145,9 @@ def test_the_only_camera_of_a_policy_must_be_the_only_one_there():
 
 def test_acting_needs_a_demonstration_and_the_same_environments(policy, demos):
     batched, seen = Batched(policy), [random_observation() for _ in range(2)]
-    with pytest.raises(ValueError, match="demo: missing, expected a call of `demonstrate`"):
+    with pytest.raises(ValueError, match="demo: missing, expected a call of `reset` with one"):
         batched.act(batch_of(seen))
-    batched.demonstrate(demos[0])
+    batched.reset(demos[0])
     batched.act(batch_of(seen))
     with pytest.raises(ValueError, match="batch: got 1 environments, expected 2 until the next `reset`"):
         batched.act(batch_of(seen[:1]))
@@ -232,11 +232,11 @@ def test_lerobot_s_loop_does_what_milx_does(policy, demos, worlds):
         [DeviceProcessorStep("cpu")], to_transition=policy_action_to_transition, to_output=transition_to_policy_action
     )
     own = LeRobotPolicy(policy)
-    with pytest.raises(ValueError, match="demo: missing, expected a call of `demonstrate`"):
+    with pytest.raises(ValueError, match="demo: missing, expected a call of `reset` with one"):
         eval_policy(worlds, own, before, after, first, last, n_episodes=1)
     for world in worlds.envs:
         world.unwrapped.episodes.clear()
-    own.demonstrate(demos[0])
+    own.reset(demos[0])
     info = eval_policy(worlds, own, before, after, first, last, n_episodes=2 * WORLDS, start_seed=5)
     agree(policy, demos[0], worlds, batches=2)
     assert info["aggregated"]["avg_sum_reward"] == LENGTH

@@ -37,6 +37,7 @@ def test_what_is_recorded_is_what_the_world_shows(tmp_path):
     recorded = record.record(connect(), NAMES, demos=3, workers=2)
     record.write(tmp_path / "set", recorded, SPLITS, FAMILIES, 3, 128, "a test")
     data = DataSet(tmp_path / "set")
+    assert data.header.fps == 12
     assert [(task.name, task.split, task.family) for task in data.header.tasks] == [
         (name, SPLITS[name], FAMILIES[name]) for name in NAMES
     ]
