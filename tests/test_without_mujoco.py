@@ -99,7 +99,7 @@ print([outcome.end for outcome in outcomes])
 """
     done = run(program, tmp_path / "set")
     assert done.returncode == 0, done.stderr[-2000:]
-    assert "3 tasks, 6 demonstrations" in done.stdout
+    assert "3 tasks, 6 demonstrations" in " ".join(done.stdout.split())
     assert done.stdout.splitlines()[-1] == "[True, True]"
 
 

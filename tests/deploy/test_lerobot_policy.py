@@ -84,12 +84,8 @@ def test_a_batch_acts_as_in_worlds(policy, demos, tmp_path, is_exported):
         own = standalone.Policy(tmp_path / "out")
     batched = Batched(own)
     found = []
-    for demo, begins in (
-        (demos[0], batched.demonstrate),
-        (None, lambda _: batched.reset()),
-        (demos[1], batched.demonstrate),
-    ):
-        begins(demo)
+    for demo in (demos[0], None, demos[1]):
+        batched.reset(demo)
         episode = [[random_observation() for _ in range(WORLDS)] for _ in range(5)]
         found.append(np.stack([batched.act(batch_of(seen)) for seen in episode]))
         expected = acted(policy, demos[0] if demo is None else demo, episode)
