@@ -4,15 +4,13 @@ import contextlib
 import dataclasses
 import io
 import json
-import resource
 import shutil
 import signal
-import time
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
+from directions import HORIZON, random_demo, tiny_config, write_directions, write_tasks
 from rich.console import Console
 from tiny import QUIET
 
@@ -25,50 +23,17 @@ from milx.data.dataset import DataSet, Writer
 from milx.deploy import standalone
 from milx.deploy.policy import read_spec
 from milx.export import export
-from milx.methods.mil import MIL
 from milx.methods.whitening import Whitening
 from milx.training import recorded
 from milx.training.factory import make_run
 from milx.training.metrics import MetricsWriter, read_metrics
 from milx.training.recorded import RecordedRun
 from milx.training.start import start_from
-from milx.types import Demo
-
-HORIZON = 8
-MEAN, SPREAD = np.array([3.0, -1.0]), np.array([2.0, 0.1])
-"""Of the actions, of very different sizes."""
-
-
-def random_demo(rng, direction, length):
-    """Draws images of a task's color, and actions along its direction and on the state."""
-    state = rng.normal(size=(length, 3)).astype(np.float32)
-    color = np.uint8(128 + 100 * np.append(direction, 0.0))
-    image = np.broadcast_to(color, (length, 12, 16, 3))
-    action = MEAN + SPREAD * (1.5 * direction + 0.5 * state[:, :2])
-    return Demo(image, state, action.astype(np.float32))
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Writes 40 tasks, each a direction, with 3 demonstrations of 7 to 12 steps."""
-    folder, rng = tmp_path_factory.mktemp("recording") / "set", np.random.default_rng(0)
-    with Writer(folder, (12, 16), 3, 2, "a test") as writer:
-        for task in range(40):
-            angle = rng.uniform(0, 2 * np.pi)
-            direction = np.array([np.cos(angle), np.sin(angle)])
-            demos = [random_demo(rng, direction, length) for length in rng.integers(7, 13, 3)]
-            split = "validation" if task < 4 else "test" if task < 10 else "train"
-            writer.add(f"direction {task}", split, [len(demo.state) for demo in demos], demos)
-    return folder
-
-
-def tiny_config(folder):
-    config = recorded.config_for(folder, preset="cpu")
-    config.recorded.horizon = HORIZON
-    config.network.filters, config.network.strides, config.network.fc_layers = (4, 4), (2, 1), (40, 40)
-    config.train.steps, config.train.log_every, config.train.eval_every = 300, 50, 100
-    config.train.meta_batch, config.optimizer.learning_rate = 8, 6e-3
-    return config
+    return write_directions(tmp_path_factory.mktemp("recording") / "set")
 
 
 @pytest.fixture(scope="module")
@@ -254,49 +219,6 @@ def test_bad_data_is_refused_before_anything_is_compiled(folder, tmp_path):
         RecordedRun(config, tmp_path / "run", QUIET)
 
 
-def run_with_losses(folder, workdir, monkeypatch, spoil):
-    """Multiplies the loss of every task by `spoil(number of the task)`, and returns the run and its output."""
-    config = tiny_config(folder)
-    config.train.steps = config.train.eval_every = 60
-    config.train.log_every, config.train.meta_batch = 20, 2
-    original = MIL.loss
-
-    def loss(self, params, batch, progress=1.0):
-        _, metrics = original(self, params, batch, progress)
-        each = metrics["loss"] * spoil(batch.task)
-        return each.mean(), {**metrics, "loss": each}
-
-    monkeypatch.setattr(MIL, "loss", loss)
-    console = Console(record=True, width=200, file=io.StringIO())
-    return RecordedRun(config, workdir, console), console
-
-
-@pytest.mark.slow
-def test_updates_that_are_not_finite_are_skipped_counted_and_named(folder, tmp_path, monkeypatch):
-    """Spoils one training task of thirty, about one batch of two in fifteen; no parameter sees it."""
-    run, console = run_with_losses(folder, tmp_path, monkeypatch, lambda n: jnp.where(n == 17, jnp.nan, 1.0))
-    run.train()
-    lines = [json.loads(line) for line in (tmp_path / "metrics.jsonl").open()]
-    skipped = [line["skipped"] for line in lines if "skipped" in line]
-    assert 0 < sum(skipped) < 20
-    assert {line["bad_task"] for line in lines if line.get("skipped")} == {17}
-    assert all(np.isfinite(line["loss"]) for line in lines if "loss" in line)
-    said = console.export_text()
-    assert said.count("were skipped: something was not finite, in task 17 of the training set") == np.count_nonzero(
-        skipped
-    )
-    params = milx.load(tmp_path).params
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(params))
-
-
-@pytest.mark.slow
-def test_a_run_without_a_finite_update_stops(folder, tmp_path, monkeypatch):
-    run, _ = run_with_losses(folder, tmp_path, monkeypatch, lambda n: jnp.inf * jnp.ones_like(n, jnp.float32))
-    monkeypatch.setattr("milx.training.loop.MOST_IN_VAIN", 30)  # after two scans of 20
-    with pytest.raises(ValueError, match="no update of the last 40 was finite; there is no checkpoint"):
-        run.train()
-
-
 @pytest.mark.slow
 def test_where_there_are_no_states_none_are_needed(tmp_path):
     """Goes from the data set to the exported policy, and compares that with `milx.load`."""
@@ -338,21 +260,6 @@ def test_what_may_be_shown_without_actions_is_not_what_is_asked_for(tmp_path):
         assert not any((shown == queries.demo.state[0]).all() for shown in support.state)
 
 
-def test_data_that_are_not_finite_are_refused_by_name(tmp_path):
-    rng = np.random.default_rng(0)
-    demos = [random_demo(rng, np.ones(2), 8) for _ in range(3)]
-    demos[1].action[3, 0] = np.inf
-    with Writer(tmp_path / "set", (12, 16), 3, 2, "a test") as writer:
-        writer.add("lift", "train", [8, 8, 8], demos)
-        for split in ("validation", "test"):
-            writer.add(split, split, [8, 8], [random_demo(rng, np.ones(2), 8) for _ in range(2)])
-    run = RecordedRun(tiny_config(tmp_path / "set"), tmp_path / "run", QUIET)
-    with pytest.raises(
-        ValueError, match=r"data: action of demonstration 1 of task 0 \('lift'\): got values that are not"
-    ):
-        run._load()
-
-
 def test_the_report_names_the_floors(finished):
     run, result = finished
     run.console = Console(record=True, width=200, file=io.StringIO())
@@ -360,30 +267,6 @@ def test_the_report_names_the_floors(finished):
     text = run.console.export_text()
     assert f"{result['action_error']['after']:.3f}" in text
     assert f"mean action {result['action_error']['mean_action']:.3f}" in text
-
-
-def write_tasks(folder, change, action_size=2):
-    """Writes six tasks for training and two for each other split, after a change of every demonstration's action."""
-    rng = np.random.default_rng(0)
-    with Writer(folder, (12, 16), 3, action_size, "a test") as writer:
-        for task, split in enumerate(["train"] * 6 + ["validation", "test"] * 2):
-            demos = [random_demo(rng, np.array([0.6, 0.8]), 7) for _ in range(2)]
-            demos = [dataclasses.replace(demo, action=change(demo.action)) for demo in demos]
-            writer.add(f"task {task}", split, [7, 7], demos)
-    return folder
-
-
-@pytest.mark.parametrize("value", [1e25, -3e15, np.inf, np.nan])
-def test_numbers_whose_squares_are_not_finite_are_refused(cache, tmp_path, value):
-    def change(action):
-        action = action.copy()
-        action[3, 1] = value
-        return action
-
-    run = make_run(tiny_config(write_tasks(tmp_path / "set", change)), tmp_path / "run", QUIET)
-    expected = r"data: action of demonstration 0 of task 0 .*: got values that are not finite or too large, expected"
-    with pytest.raises(ValueError, match=expected):
-        run.train()
 
 
 def test_a_score_without_anything_to_learn_is_a_number():
@@ -441,26 +324,3 @@ def test_sizes_that_cannot_be_are_refused(finished, tmp_path, values):
     path.write_text(json.dumps(good | values if isinstance(values, dict) and values else values))
     with pytest.raises(ValueError, match=r"spec\.json: expected the sizes of a policy: .*(expected|no such field)"):
         read_spec(path)
-
-
-def test_a_full_disk_stops_neither_training_nor_the_metrics_that_still_fit(tmp_path):
-    """Limits the size of files, as a full disk does: both files stop growing, are reported, and nobody waits."""
-    reports, before = [], signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    writer = MetricsWriter(tmp_path, 0, reports.append)
-    writer.write(1, {"loss": 1.0})
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (150, limits[1]))
-    began = time.monotonic()
-    try:
-        for step in range(2, 200):
-            writer.write(step, {"loss": 1.0, "validation_success": 0.5})
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-        signal.signal(signal.SIGXFSZ, before)
-    assert time.monotonic() - began < 20
-    assert sum("TensorBoard's events could not be written: " in report for report in reports) == 1
-    assert sum(report.startswith("metrics of step 199 could not be written: ") for report in reports) == 1
-    with writer:
-        writer.write(200, {"loss": 0.5})  # there is room again
-    lines = read_metrics(tmp_path / "metrics.jsonl")
-    assert lines[0] == {"step": 1, "loss": 1.0}
