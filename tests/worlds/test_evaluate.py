@@ -11,6 +11,7 @@ import sys
 import textwrap
 import time
 
+import imageio.v3 as iio
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -245,6 +246,31 @@ def test_a_run_is_evaluated_in_the_world_whose_tasks_its_data_set_names(policy, 
     assert own["end_wilson95"] == pytest.approx(wilson_interval(8, 8))
     assert found["controls"]["same_family"]["ever"] == 0
     assert re.search(r"its own demonstration.* 100.0% \(68 to 100\)", console.file.getvalue())
+
+
+def test_the_video_shows_the_demonstration_beside_the_trial(policy, monkeypatch, tmp_path):
+    """Colors every image by its time step; the shorter one of the two keeps its last image."""
+
+    def gray(steps, first):
+        return [np.full((6, 10, 3), first + 20 * step, np.uint8) for step in range(steps)]
+
+    tasks = [Task("a", demos=(Demo(np.stack(gray(4, 10))),)), Task("b", demos=(Demo(np.stack(gray(2, 15))),))]
+    outcomes = [
+        Outcome(Episode("own", 0, 0), images=gray(2, 130)),
+        Outcome(Episode("own", 1, 0), images=gray(3, 135)),
+        Outcome(Episode("own", 1, 1)),
+    ]
+    seeing = dataclasses.replace(policy, spec=Spec((6, 10), 2, 2, None, ()))
+    for name, value in (("load_run", seeing), ("DataSet", None), ("tasks_of", tasks), ("evaluate_in", outcomes)):
+        monkeypatch.setattr(report, name, lambda *_, value=value, **__: value)
+    policy.config.recorded.path = "somewhere"
+    report.report_on(policy.config, tmp_path, "point_world:make", Console(file=io.StringIO()))
+    frames = iio.imread(tmp_path / report.VIDEO).astype(int)
+    left, gap, right = frames[:, 3, 5, 0], frames[:, 3, 14, 0], frames[:, 3, 23, 0]
+    expected = np.array([(10, 130), (30, 150), (50, 150), (70, 150), (15, 135), (35, 155), (35, 175)])
+    changes = np.flatnonzero(np.diff(left) | np.diff(right)) + 1  # the last image of a task stays
+    np.testing.assert_allclose(np.stack([left, right], axis=1)[np.append(0, changes)], expected, atol=2)
+    assert (gap > 250).all()
 
 
 def in_words(successes, episodes):
