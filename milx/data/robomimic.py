@@ -27,6 +27,7 @@ from milx.data.mapping import lookup, read_mapping
 from milx.types import Demo, by_field
 
 _MOST_FPS = 10_000
+"""What says more time steps in a second is no control frequency."""
 
 
 class Robomimic:
