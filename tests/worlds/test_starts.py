@@ -110,6 +110,14 @@ class Showing:
         pass
 
 
+def test_a_world_that_was_closed_is_not_started_again():
+    world = Dying()
+    slot = Slot(world.connect, Spec(None, 2, 2, None, ()), 6)
+    slot.close()
+    slot.start()
+    assert not world.started and slot.problem == "the evaluation has ended"
+
+
 def test_another_world_shows_what_comes_after_the_task_in_whose_demonstration_one_has_ended():
     tasks, spec = [Task(name) for name in ("a", "b", "c")], Spec(None, 2, 2, None, ())
     slots = [Slot(connect, spec, 6) for connect in (Dying().connect, Showing)]
