@@ -47,9 +47,9 @@ def _refusals(data: DataSet) -> list[str]:
     for split in SPLITS:
         if not head.of_split(split):
             found.append(f"no {split} tasks: training refuses this data set")
-        elif not any(sum(head.tasks[i].has_action) > 1 for i in head.of_split(split)):
+        elif not any(head.tasks[i].suffices(1, given_action=True) for i in head.of_split(split)):
             unless = ""
-            if any(len(head.tasks[i].lengths) > 1 and any(head.tasks[i].has_action) for i in head.of_split(split)):
+            if any(head.tasks[i].suffices(1, given_action=False) for i in head.of_split(split)):
                 unless = f" unless method.given is {' or '.join(GIVEN[1:])}"
             found.append(f"no {split} task with two demonstrations that show actions: training refuses this{unless}")
     for number, task in enumerate(head.tasks):

@@ -12,6 +12,8 @@ from milx.types import SPLITS, ImageShape, are_indices, by_field, is_image_shape
 
 VERSION = 2
 """The number of the layout of data sets. Those of version 1 have one camera."""
+MOST_FPS = 1e6
+"""What says that there are more time steps in a second is no rate."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,6 +35,16 @@ class TaskInfo:
     has_action: tuple[bool, ...]
     family: str = ""
     instructions: tuple[str, ...] = ()
+
+    def suffices(self, shots: int, given_action: bool) -> bool:
+        """Tells whether a policy can adapt to so many demonstrations and be judged by the actions of another one.
+
+        Args:
+            shots: demonstrations to adapt to.
+            given_action: whether these have to show actions, too.
+        """
+        support = sum(self.has_action) if given_action else len(self.lengths)
+        return any(self.has_action) and support > shots
 
 
 @dataclasses.dataclass(frozen=True)
@@ -125,7 +137,7 @@ def parse_header(values: dict[str, Any]) -> Header:
         tasks.append(info)
     fps = values.get("fps")
     if fps is not None:
-        if not isinstance(fps, numbers.Real) or isinstance(fps, bool) or not 0 < float(fps) < 1e6:
+        if not isinstance(fps, numbers.Real) or isinstance(fps, bool) or not 0 < float(fps) < MOST_FPS:
             raise ValueError(f"fps: got {fps!r:.100}, expected a positive number")
         fps = float(fps)
     state_names, action_names = (

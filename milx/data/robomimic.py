@@ -23,11 +23,9 @@ from milx.data import cameras
 from milx.data import episodes as shared
 from milx.data.dataset import check_size
 from milx.data.episodes import Contents, Episode
+from milx.data.header import MOST_FPS
 from milx.data.mapping import lookup, read_mapping
 from milx.types import Demo, by_field
-
-_MOST_FPS = 10_000
-"""What says more time steps in a second is no control frequency."""
 
 
 class Robomimic:
@@ -146,7 +144,7 @@ def _fps(file: Any) -> float | None:
     except (KeyError, TypeError, ValueError, RecursionError):
         return None
     is_number = isinstance(found, int | float) and not isinstance(found, bool)
-    return float(found) if is_number and 0 < found < _MOST_FPS else None
+    return float(found) if is_number and 0 < found < MOST_FPS else None
 
 
 def _demos(file: Any) -> list[str]:

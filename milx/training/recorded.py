@@ -180,9 +180,7 @@ class RecordedRun(Run):
             raise ValueError(f"data: {config.recorded.path} has {spec}, expected {trained}, as when the run began")
 
     def _enough(self, task: int, shots: int) -> bool:
-        info = self.data.header.tasks[task]
-        support = sum(info.has_action) if self.given_action else len(info.lengths)
-        return any(info.has_action) and support > shots
+        return self.data.header.tasks[task].suffices(shots, self.given_action)
 
     @property
     def _sizes(self) -> tuple[int, int, int]:
