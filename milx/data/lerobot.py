@@ -21,8 +21,7 @@ from absl import app
 from PIL import Image
 
 from milx.core import files
-from milx.data import cameras
-from milx.data import episodes as shared
+from milx.data import cameras, command_line
 from milx.data.dataset import check_size
 from milx.data.episodes import Contents, Episode
 from milx.data.mapping import lookup, read_mapping
@@ -300,9 +299,9 @@ def _read_table(file: pathlib.Path, columns: tuple[str, ...]) -> Any:
 
 def main(argv: list[str]) -> None:
     """Imports PATH as OUT."""
-    shared.run(argv, lambda path, flags: LeRobot(path, flags.camera, flags.state, flags.action, flags.height))
+    command_line.run(argv, lambda path, flags: LeRobot(path, flags.camera, flags.state, flags.action, flags.height))
 
 
 if __name__ == "__main__":
-    shared.define_flags(state="observation.state", action="action", task="task_index")
+    command_line.define_flags(state="observation.state", action="action", task="task_index")
     app.run(main)

@@ -19,8 +19,7 @@ from absl import app
 
 from milx.core import files
 from milx.core.files import FileError
-from milx.data import cameras
-from milx.data import episodes as shared
+from milx.data import cameras, command_line
 from milx.data.dataset import check_size
 from milx.data.episodes import Contents, Episode
 from milx.data.header import MOST_FPS
@@ -200,9 +199,9 @@ def _check_links(file: Any, name: str) -> None:
 
 def main(argv: list[str]) -> None:
     """Imports PATH as OUT."""
-    shared.run(argv, lambda path, flags: Robomimic(path, flags.camera, flags.state, flags.action, flags.height))
+    command_line.run(argv, lambda path, flags: Robomimic(path, flags.camera, flags.state, flags.action, flags.height))
 
 
 if __name__ == "__main__":
-    shared.define_flags(state="robot0_eef_pos,robot0_eef_quat,robot0_gripper_qpos", action="actions", task="file")
+    command_line.define_flags(state="robot0_eef_pos,robot0_eef_quat,robot0_gripper_qpos", action="actions", task="file")
     app.run(main)

@@ -23,7 +23,7 @@ from rich.progress import track
 
 from milx.core.commands import command
 from milx.core.messages import warn
-from milx.data import episodes, splits
+from milx.data import command_line, splits
 from milx.data.cameras import fitted, shrunk
 from milx.data.dataset import Writer
 from milx.types import Demo, by_field, from_fields
@@ -164,5 +164,5 @@ if __name__ == "__main__":
     flags.DEFINE_string("python", sys.executable, "The interpreter that runs the environments.")
     flags.DEFINE_integer("workers", 4, "Environments at once.", lower_bound=1)
     flags.DEFINE_float("timeout", 60.0, "Seconds that a demonstration may take.")
-    episodes.define_split_flags()
+    command_line.define_split_flags()
     app.run(main)

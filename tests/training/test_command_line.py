@@ -206,8 +206,8 @@ def stopped(name, function, arguments):
 
     module = importlib.import_module(name)
     setattr(module, function, wait)
-    if hasattr(module, "shared"):
-        module.shared.define_flags(state="", action="", task="")
+    if function in ("LeRobot", "Robomimic"):
+        module.command_line.define_flags(state="", action="", task="")
     flags.FLAGS(["milx", *(argument for argument in arguments if argument.startswith("--"))])
     module.main(["milx", *(argument for argument in arguments if not argument.startswith("--"))])
 
