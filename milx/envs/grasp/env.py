@@ -103,7 +103,7 @@ class Grasp(Env[GraspTask]):
     goal_indices = (0, 1)
     ahead = 20
     action_cost = 0.02
-    version = 2
+    version = 3
 
     def __init__(self, image_shape: tuple[int, int] | None = None):
         super().__init__(_build(), image_shape)
@@ -169,7 +169,7 @@ class Grasp(Env[GraspTask]):
     def steering(self) -> Steering:
         """The actions [5], where 0 opens the fingers; the hand returns to where it is expected."""
         scale = jnp.array([MAX_SPEED] * 3 + [MAX_TURN])
-        opened, deviation = jnp.array([0, 0, 0, 0, -0.6]), jnp.array([0.3, 0.3, 0.3, 0.3, 0.6])
+        opened, deviation = jnp.array([0, 0, 0, 0, -0.6]), jnp.array([0.3, 0.3, 0.3, 0.1, 0.6])
 
         def correction(state: State, expected: State) -> jax.Array:
             return jnp.pad(TRACKING * (expected.qpos[_HAND] - state.qpos[_HAND]) / scale, (0, 1))
