@@ -2,6 +2,7 @@
 
     python -m milx.evaluate runs/reach-mil-fast-0
     python -m milx.evaluate runs/my_arm-mil-fast-0 --gym=my_world:make
+    python -m milx.evaluate runs/my_arm-mil-fast-0 --gym=my_world:make --data=new_tasks
 
 The first command writes evaluation.json and the plot in the run's folder anew, and the video if the run is in
 simulation.
@@ -10,6 +11,9 @@ The second one is for runs on recorded demonstrations. `my_world.make(task)` ret
 held-out task of the data set; the policy is adapted to the task's demonstrations and acts there, beside controls. It
 writes gym.json, and gym.gif where the policy sees images. `milx/worlds/worker.py` describes what the environment must
 be like; it runs in processes of its own, which need NumPy, Gymnasium and your code alone (--python).
+
+The third one does the same with all tasks of another data set, which should be new to the policy; your own expert may
+have recorded it in that world (`milx.worlds.record`).
 """
 
 import pathlib
@@ -26,6 +30,7 @@ from milx.training.factory import make_run
 from milx.worlds.report import report_on
 
 _GYM = flags.DEFINE_string("gym", None, "A function that makes Gymnasium environments, as module:function.")
+_DATA = flags.DEFINE_string("data", None, "With --gym: another data set, whose tasks are all tried.")
 _PYTHON = flags.DEFINE_string("python", sys.executable, "With --gym: the interpreter that runs the environments.")
 _WORKERS = flags.DEFINE_integer("workers", 4, "With --gym: environments at once.", lower_bound=1)
 _EPISODES = flags.DEFINE_integer("episodes", 10, "With --gym: episodes of every task and control.", lower_bound=1)
@@ -50,7 +55,7 @@ def main(argv: list[str]) -> None:
             run.report(run.evaluate())
         else:
             options: dict[str, Any] = {"episodes": _EPISODES.value, "workers": _WORKERS.value}
-            options |= {"python": _PYTHON.value, "timeout": _TIMEOUT.value}
+            options |= {"data": _DATA.value, "python": _PYTHON.value, "timeout": _TIMEOUT.value}
             report_on(config, path.parent, _GYM.value, **options)
 
 

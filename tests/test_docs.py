@@ -77,7 +77,7 @@ def test_the_commands_for_demonstrations_of_ones_own_run(tmp_path, cache):
         done = subprocess.run([sys.executable, *words[1:]], cwd=tmp_path, capture_output=True, text=True)
         assert done.returncode == 0, f"{line}\n{done.stdout[-2000:]}{done.stderr[-2000:]}"
         ran += 1
-    assert ran == 9
+    assert ran == 11
     found = json.loads((tmp_path / "runs" / "demos" / "gym.json").read_text())["controls"]
     assert found["replay"]["ever"] > found["random"]["ever"]
     assert (tmp_path / "exported_chunks" / "policy.py").is_file()

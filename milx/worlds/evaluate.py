@@ -19,12 +19,12 @@ FIRST_SEED = 1_000_000
 """Of the episodes, unless another is chosen."""
 
 
-def tasks_of(data: DataSet, split: str, policy: Policy) -> list[Task]:
+def tasks_of(data: DataSet, split: str | None, policy: Policy) -> list[Task]:
     """Lists the tasks of a split that have as many demonstrations as the policy's run was evaluated with.
 
     Args:
         data: the data set; the names of its tasks are those of the world.
-        split: "train", "validation" or "test".
+        split: "train", "validation" or "test", or None for all tasks.
         policy: what is to be adapted.
 
     Raises:
@@ -32,13 +32,14 @@ def tasks_of(data: DataSet, split: str, policy: Policy) -> list[Task]:
     """
     shots, needs_action = policy.config.evaluation.shots, policy.config.method.given == GIVEN[0]
     tasks = []
-    for number in data.header.of_split(split):
+    for number in range(len(data.header.tasks)) if split is None else data.header.of_split(split):
         info = data.header.tasks[number]
         shown = [i for i, has_action in enumerate(info.has_action) if has_action or not needs_action][:shots]
         if len(shown) == shots:
             tasks.append(Task(info.name, info.family, tuple(data.read(number, i) for i in shown)))
     if not tasks:
-        raise ValueError(f"data: {data.folder} has no {split} task with {shots} demonstrations, expected at least one")
+        kind = "task" if split is None else f"{split} task"
+        raise ValueError(f"data: {data.folder} has no {kind} with {shots} demonstrations, expected at least one")
     return tasks
 
 

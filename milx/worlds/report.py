@@ -29,14 +29,22 @@ _FILMED = 3
 """Tasks in the video."""
 
 
-def report_on(config: Config, folder: pathlib.Path, make: str, console: Console | None = None, **options: Any) -> None:
-    """Evaluates a run on the test tasks of its data set, prints a table, and writes FILE and VIDEO.
+def report_on(
+    config: Config,
+    folder: pathlib.Path,
+    make: str,
+    console: Console | None = None,
+    data: str | None = None,
+    **options: Any,
+) -> None:
+    """Evaluates a run on the test tasks of its data set, or on all of another one's; writes FILE and VIDEO.
 
     Args:
         config: of the run.
         folder: the run's.
         make: "module:function", which makes the world.
         console: where to report.
+        data: the folder of another data set, recorded in this world, say; by default it is the run's.
         **options: further arguments of `evaluate_in`.
 
     Raises:
@@ -45,7 +53,7 @@ def report_on(config: Config, folder: pathlib.Path, make: str, console: Console 
     if not config.recorded.path:
         raise ValueError(f"gym: {folder} is a run in simulation, expected one on recorded demonstrations (--data)")
     console, policy = console or Console(), load_run(folder)
-    tasks = tasks_of(DataSet(config.recorded.path), "test", policy)
+    tasks = tasks_of(DataSet(data), None, policy) if data else tasks_of(DataSet(config.recorded.path), "test", policy)
     with progress.phase(console, f"acting in {make}"):
         outcomes = evaluate_in(policy, make, tasks, film=_FILMED, **options)
     found = summarize(outcomes, tasks)
@@ -54,6 +62,7 @@ def report_on(config: Config, folder: pathlib.Path, make: str, console: Console 
         {
             "world": make,
             "criterion": "info['is_success'] or info['success'], at any time and at the end of an episode",
+            "data": data or config.recorded.path,
             "tasks": [task.name for task in tasks],
             "controls": found,
             "lost": losses(outcomes, tasks),

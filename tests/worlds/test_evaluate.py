@@ -246,6 +246,22 @@ def test_a_run_is_evaluated_in_the_world_whose_tasks_its_data_set_names(policy, 
     assert own["end_wilson95"] == pytest.approx(wilson_interval(8, 8))
     assert found["controls"]["same_family"]["ever"] == 0
     assert re.search(r"its own demonstration.* 100.0% \(68 to 100\)", console.file.getvalue())
+    assert found["data"] == str(tmp_path / "set")
+
+
+def test_a_run_is_evaluated_on_all_tasks_of_another_data_set(policy, monkeypatch, tmp_path):
+    """The other one has tasks of all splits, and the run's own, which does not exist, is not read."""
+    with Writer(tmp_path / "later", None, 2, 2, "a test") as writer:
+        for name, split in (("near/left", "train"), ("far/right", "validation"), ("near/right", "test")):
+            shown = point_world.PointWorld(name).demonstrate(7)
+            writer.add(name, split, [point_world.LENGTH], [Demo(**shown)])
+    policy.config.recorded.path = str(tmp_path / "missing")
+    monkeypatch.setattr(report, "load_run", lambda folder: policy)
+    options = {"episodes": 3, "workers": 2, "data": str(tmp_path / "later")}
+    report.report_on(policy.config, tmp_path, "point_world:make", Console(file=io.StringIO()), **options)
+    found = json.loads((tmp_path / "gym.json").read_text())
+    assert (found["data"], found["tasks"]) == (options["data"], ["near/left", "far/right", "near/right"])
+    assert {name: found["controls"][name]["end"] for name in ("own", "same_family")} == {"own": 1.0, "same_family": 0.0}
 
 
 def test_the_video_shows_the_demonstration_beside_the_trial(policy, monkeypatch, tmp_path):
