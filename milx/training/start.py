@@ -84,6 +84,8 @@ def _of_policy(source: str, learned: dict[str, Any], config: Config) -> tuple[di
     if drawn[0] in arrays:
         fields = _CONVOLUTIONS if convolutions else _DENSE
         expected = f"{_differences(theirs, config, fields)}, as {source} has"
+    elif any(name.startswith(f"{drawn[0].partition('.vision_')[0]}.vision.") for name in arrays):
+        expected = f"network.share_encoder=True, as {source} sees one camera"
     else:
         expected = f"the same method, cameras and layers: {source} has no {drawn[0]}"
     if not found.keys() & kernels:

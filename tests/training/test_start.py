@@ -156,8 +156,7 @@ def test_the_settings_that_a_message_names_make_all_convolutions_fit(source, cap
         (
             1,
             {"left": (64, 64), "right": (64, 64)},
-            "8 of the 8 kernels of convolutions, which need the same method, cameras and layers: push has no "
-            "policy.vision_left.ConvBlock_0.kernel",
+            "8 of the 8 kernels of convolutions, which need network.share_encoder=True, as push sees one camera",
         ),
     ],
 )
@@ -167,6 +166,9 @@ def test_convolutions_that_have_other_channels_or_names_are_told(history, image_
     config.network.kernel, config.recorded.history = 5, history
     start_from("push", shapes_of(config, image_shape), config)
     assert capsys.readouterr().out.endswith(f"; all others are drawn, among them {said}\n")
+    config.network.share_encoder, config.recorded.history = True, 1
+    start_from("push", shapes_of(config, image_shape), config)
+    assert capsys.readouterr().out.endswith("; all others are drawn\n")
 
 
 @pytest.mark.parametrize(
