@@ -116,6 +116,7 @@ def test_demos():
     assert all(good.count(shown) > 3 for shown in GIVEN)
 
 
+@pytest.mark.slow
 @cases("observations")
 @given(ARRAYS, ARRAYS)
 def test_observations(image, state):
@@ -132,6 +133,7 @@ JSON = st.recursive(
 )
 
 
+@pytest.mark.slow
 @cases("configs")
 @given(data=st.data())
 def test_configs(data):
@@ -224,6 +226,7 @@ def test_headers_of_data_sets(data_set, data):
                 assert value is None or (value.size <= 12 * 60 and np.unique(value).size <= 1)
 
 
+@pytest.mark.slow
 @cases("lerobot")
 @given(data=st.data())
 def test_metadata_of_lerobot(data, tmp_path_factory):

@@ -17,7 +17,7 @@ DOCS = pathlib.Path(__file__).parents[1] / "docs"
 FIXTURES = pathlib.Path(__file__).parent / "fixtures"
 PAGES = sorted(DOCS.rglob("*.md"))
 SLOW = ("add_an_environment", "meta_learn_anything", "render", "your_own_demonstrations")
-"""Names of pages whose blocks take more than five seconds."""
+"""Names of pages whose blocks take more than three seconds."""
 
 
 def blocks(path, language):

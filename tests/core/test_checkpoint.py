@@ -63,6 +63,7 @@ DAMAGES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_every_file_of_the_newest_checkpoint_is_guarded(folder, tmp_path, damage):
     """Damages each file in turn: the damage is reported, the checkpoint before it is used, and nothing is lost."""

@@ -35,6 +35,7 @@ def test_an_import_changes_nothing_and_says_nothing():
     assert run(STATE) == (0, "", "")
 
 
+@pytest.mark.slow
 def test_configured_in_time_an_environment_is_content(tmp_path):
     program = (
         STATE
@@ -45,6 +46,7 @@ def test_configured_in_time_an_environment_is_content(tmp_path):
     assert "warp" not in error, "MJX misses a package that nobody needs here, and says so when it is imported"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("calls", "message"),
     [

@@ -131,6 +131,7 @@ def test_cache_notices_other_arguments(trained, tmp_path, monkeypatch):
     assert len(asked) == len(requests), "the batch of the planner does not change the set"
 
 
+@pytest.mark.slow
 def test_planning_that_was_killed_goes_on_with_the_next_part(trained, tmp_path, monkeypatch, capsys):
     """Plans 24 demonstrations, 10 at once; the second part is damaged meanwhile."""
     perform, calls = demos_lib.perform, []
@@ -297,6 +298,7 @@ def test_only_successful_demonstrations_are_drawn(trained):
         assert drawn[2:].min() > 0
 
 
+@pytest.mark.slow
 def test_a_redrawn_batch_shows_the_same_demonstrations_in_new_colors_and_places(trained):
     env, keys = trained.run.env, jax.random.split(jax.random.key(6), 3)
     batches = [

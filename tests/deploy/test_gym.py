@@ -18,6 +18,7 @@ def gym_env():
     return GymEnv("reach", split="test", image_shape=(16, 20), render_mode="rgb_array")
 
 
+@pytest.mark.slow
 def test_the_checker_of_gymnasium_is_content(gym_env):
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -16,6 +16,7 @@ from milx.deploy import pretrained
 from milx.deploy.policy import Policy
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["place", "push", "reach"])
 def test_a_shipped_policy_is_adapted_by_its_demonstration(name):
     """Compares success with the task-blind expert's, actions after two demonstrations, and actions with stored ones."""

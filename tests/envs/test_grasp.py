@@ -102,6 +102,7 @@ def in_c(env, task, start):
     return np.array(positions)
 
 
+@pytest.mark.slow
 def test_the_hand_and_what_lies_on_the_table_move_as_in_mujoco(env, tasks, starts, shown):
     """Compares the time until the fingers close."""
     for number in range(4):
@@ -109,6 +110,7 @@ def test_the_hand_and_what_lies_on_the_table_move_as_in_mujoco(env, tasks, start
         np.testing.assert_allclose(shown.qpos[number, :18], expected, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_grasp_lifts_as_many_things_as_in_mujoco(env, tasks, starts, shown):
     """Counts lifted things: how a grasp goes on after its first contact depends on the last digit."""
     expected = [in_c(env, first(tasks, n), first(starts, n))[32, 8] > 0.06 for n in range(len(tasks.target))]
@@ -187,6 +189,7 @@ def test_the_cost_is_what_its_weights_say(env, tasks, starts):
     assert np.isfinite(slope(on_mat)).all()
 
 
+@pytest.mark.slow
 def test_things_rest_where_they_are_laid(follow, tasks, starts):
     """Leaves the open hand where it is for half a second: nothing moves by more than 1 mm or 1 mrad."""
     here = jnp.insert(starts.qpos[:, :3], 3, -1.0, axis=1)
@@ -219,6 +222,7 @@ def test_kinds_of_things_and_mats_are_those_of_the_split(env, split):
     assert all(len(set(row)) == 4 for row in kinds)
 
 
+@pytest.mark.slow
 def test_mats_lie_on_the_shelf_with_their_whole_outlines(env, tasks, starts):
     """Measures in C MuJoCo how far their capsules reach, and stand out."""
     for number in range(len(tasks.target)):

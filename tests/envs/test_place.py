@@ -170,6 +170,7 @@ def dropped(env):
     return tasks, states, fall(env, tasks, states)
 
 
+@pytest.mark.slow
 def test_what_is_let_go_over_the_middle_of_a_container_comes_to_rest_in_it(env, dropped):
     tasks, states, (fallen, _) = dropped
     end, velocity = fallen.qpos[:, :3], fallen.qvel[:, :3]
@@ -184,6 +185,7 @@ def test_what_is_let_go_over_the_middle_of_a_container_comes_to_rest_in_it(env, 
     assert (end[:, 2] < rim + 0.06).all()
 
 
+@pytest.mark.slow
 def test_the_fall_is_that_of_mujoco(env, dropped):
     """Compares where things come to rest, and that they do within the rim; contacts with boxes differ."""
     tasks, states, (fallen, _) = dropped
@@ -340,6 +342,7 @@ def test_the_task_blind_forget_the_target_alone(env, task):
     np.testing.assert_array_equal(blind.container[5], task.container)
 
 
+@pytest.mark.slow
 def test_the_hand_of_a_state_far_from_all_containers_misses(env, task):
     state = held_over(env, task, jax.random.key(8))
     away = dataclasses.replace(state, mocap_pos=state.mocap_pos.at[task.target].set(FAR))

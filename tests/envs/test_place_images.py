@@ -25,6 +25,7 @@ def task(env):
     return env.sample_task(jax.random.key(0), "train")
 
 
+@pytest.mark.slow
 def test_the_image_is_that_of_the_tasks_own_model(env, task):
     """Compares geoms, sizes and colors with C MuJoCo's poses; what is not used is not seen."""
     task = dataclasses.replace(task, texture=task.texture._replace(family=jnp.zeros(4, jnp.int32)))

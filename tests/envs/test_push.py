@@ -72,6 +72,7 @@ def push_along(env, task, start, actions):
     return jax.lax.scan(lambda state, action: (env.step(task, state, action),) * 2, start, actions)[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("touched", [0, 1])
 def test_an_episode_of_pushing_is_that_of_mujoco(env, task, touched):
     # One object lies before the hand, which pushes it, unevenly, and goes on its way.
@@ -146,6 +147,7 @@ def test_a_tactic_is_how_far_to_the_side_of_the_objects_center_the_hand_meets_it
     np.testing.assert_allclose(np.mean(met, axis=1), (0.02, -0.02), atol=0.004)
 
 
+@pytest.mark.slow
 def test_demonstrations_record_the_controllers_answers_before_the_noise(env, shown):
     tasks, states, action = shown
     answers = jax.jit(jax.vmap(jax.vmap(jax.vmap(env.control, (None, None, 0)), (None, 0, None)), (0, 0, None)))
@@ -186,6 +188,7 @@ def test_the_hand_starts_low_enough_for_every_shape(env, task):
         assert end < heights.max() + 2e-3, name
 
 
+@pytest.mark.slow
 def test_the_image_is_that_of_the_tasks_own_model(env, task):
     """Compares geoms, sizes and colors of objects without a texture; what is not used is not seen."""
     task = dataclasses.replace(task, texture=task.texture._replace(family=jnp.zeros(2, jnp.int32)))

@@ -98,6 +98,7 @@ def test_the_planner_s_step_is_close_to_the_exact_one(env, task, actions, states
     np.testing.assert_allclose(B, B_exact, rtol=0, atol=1e-3 * np.abs(B_exact).max())
 
 
+@pytest.mark.slow
 def test_jacobians_of_an_action_are_differences_of_c_mujoco(env, task, states):
     """Compares with central differences of step 1e-6, whose rounding error is about 1e-12 / 1e-6."""
     states, _ = states

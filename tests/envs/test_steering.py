@@ -48,6 +48,7 @@ def hand(env, state):
     return np.array([*pose[:3], np.arctan2(pose[4], pose[3])]), np.linalg.norm(pose[6:8])
 
 
+@pytest.mark.slow
 def test_the_hand_of_push_moves_as_its_controls_say_and_stays_upright(push, free):
     velocity = np.array([0.2, 0.1, 0.05, 0.8])
     states = drive(push, free, jnp.asarray(velocity))
@@ -60,6 +61,7 @@ def test_the_hand_of_push_moves_as_its_controls_say_and_stays_upright(push, free
     assert hand(push, after)[1] < 0.03
 
 
+@pytest.mark.slow
 def test_the_hand_of_push_returns_to_where_it_is_expected(push, free):
     """It is expected on the other side of the half turn, where angles jump."""
 

@@ -114,6 +114,7 @@ def test_the_size_of_the_step_is_relative_to_the_tensor(batch):
     assert found["own_demo"] < found["no_demo"]
 
 
+@pytest.mark.slow
 def test_a_run_imitates_first_and_measures_the_batch_that_comes_next(batch):
     method, rate = MIL(MILConfig(inner_lr=0.1, inner_clip=1e9, imitation_steps=2), CONSTANT), 0.05
     train = TrainConfig(steps=10, meta_batch=TASKS)

@@ -66,6 +66,7 @@ def test_the_loss_of_a_class_is_its_negative_log_likelihood():
     assert float(parts["action_loss"]) == pytest.approx(expected, rel=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["mil", "contextual"])
 def test_a_policy_does_one_of_the_two_values(name):
     """Adapts to random demonstrations and acts on random observations: both values are done, and nothing between."""

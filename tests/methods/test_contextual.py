@@ -81,6 +81,7 @@ def trained(name, vision):
     return fit((params, optimizer.init(params)))[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "vision"), CASES)
 def test_a_method_fits_two_tasks_and_with_swapped_demonstrations_does_the_other(name, vision):
     """Compares with a blind policy, which errs by a quarter of the tasks' squared difference.

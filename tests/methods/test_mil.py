@@ -180,6 +180,7 @@ def test_closed_form_of_the_clipped_step(constant_case):
     np.testing.assert_allclose(gradient["policy"], expected.mean(axis=0), rtol=1e-11)
 
 
+@pytest.mark.slow
 def test_an_adapted_policy_is_sharpened_and_the_meta_objective_is_not(batch):
     plain, params = build({"goal_head": True, "soft_argmax": True}, goal_weight=0.7)
     sharp, _ = build({"goal_head": True, "soft_argmax": True}, goal_weight=0.7, sharpness=4.0)

@@ -177,6 +177,7 @@ def test_adapt_under_vmap_equals_a_loop(batch):
         assert_trees_close(jax.tree.map(lambda x, i=i: np.asarray(x)[i], together), alone)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tasks_at_once", [1, 2])
 def test_meta_gradient_of_a_few_tasks_at_a_time(batch, monkeypatch, tasks_at_once):
     method, params = build()
@@ -254,6 +255,7 @@ def test_imitating_its_own_actions_is_without_loss(batch):
         assert law(loss), f"inner {inner}: {loss}"
 
 
+@pytest.mark.slow
 def test_meta_gradient_is_that_of_reverse_over_reverse(batch, monkeypatch):
     method, params = build(inner_steps=2, inner_clip=0.05, learn_inner_lr=True)
     grads = {}
@@ -265,6 +267,7 @@ def test_meta_gradient_is_that_of_reverse_over_reverse(batch, monkeypatch):
     assert_trees_close(found["inner_log_lr"], expected["inner_log_lr"])
 
 
+@pytest.mark.slow
 def test_mixed_precision_keeps_the_meta_gradient_and_its_type(batch):
     method, params = build(inner_lr=0.01)
     mixed, _ = build({"mixed_precision": True}, inner_lr=0.01)

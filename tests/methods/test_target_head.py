@@ -80,6 +80,7 @@ def test_listening_remembers_the_first_image(case):
     np.testing.assert_allclose(found["no_demo"], (error / np.var(demo.action[0], axis=0)).mean(), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_policies_with_a_memory_act_step_by_step(case, tmp_path):
     """Compares the policy and its export with the loop; without their memory they do not act at all."""
     method, _, demo = case

@@ -87,6 +87,7 @@ def test_the_bank_answers_to_what_the_images_show_and_not_to_brightness():
     np.testing.assert_array_equal(filters.kernel, again.kernel)
 
 
+@pytest.mark.slow
 def test_no_gradient_reaches_the_fixed_layer_and_adaptation_leaves_it():
     policy = make_policy(CONFIG, (12, 16), 3, 2, goal_size=0)
     method = MIL(MILConfig(inner_lr=0.1, learn_inner_lr=True), policy)

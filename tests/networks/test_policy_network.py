@@ -125,6 +125,7 @@ def test_the_prediction_of_the_goal_reaches_the_action(inputs):
     assert np.abs(moved.action - plain.action).max() > 1e-3
 
 
+@pytest.mark.slow
 def test_the_first_image_of_an_episode_tells_the_target_of_all_its_steps(inputs):
     network, params = build(target_head=True)
     image, state = inputs

@@ -113,6 +113,7 @@ def test_the_kernel_refuses_textures():
         renderer.paint(renderer.scene(data), interpret=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("mesh", "shadows", "by_kernel"), [("bare", False, True), ("bare", True, False), ("seen", False, False)]
 )

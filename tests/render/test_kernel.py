@@ -54,6 +54,7 @@ def test_kernel_passes_over_geoms_without_alpha():
     assert changed[seen != hidden].mean() < 2e-3
 
 
+@pytest.mark.slow
 def test_kernel_paints_in_float32_whatever_the_scene_is_in():
     single = render_both(1)[0]
     with jax.enable_x64(True):

@@ -209,6 +209,7 @@ def test_a_ball_of_triangles_is_lit_as_a_ball_and_shades_only_what_lies_behind_i
     assert (aside < 0.97).sum() > 10 and (aside > 1.03).sum() > 100
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 def test_the_kernel_paints_meshes_as_the_reference_renders_them(seed):
     """Beside primitives that hide them and are hidden; the image is no multiple of the kernel's tile."""

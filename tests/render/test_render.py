@@ -69,6 +69,7 @@ def test_an_mjx_model_counts_as_a_model_with_its_values_does(model, data):
     assert np.abs(found.color[0] - found.color[1]).max() > 0.1
 
 
+@pytest.mark.slow
 def test_several_cameras_see_what_each_sees(model, data):
     both = render(model, data, ["top", "front"], HEIGHT, WIDTH, shadows=True)
     for i, camera in enumerate(("top", "front")):
@@ -103,6 +104,7 @@ def test_the_gradient_of_colors_and_lights_is_that_of_differences(model, data, n
     assert np.abs(gradient).max() > 0.005
 
 
+@pytest.mark.slow
 def test_rendering_needs_nothing_else_of_milx():
     code = f"""import sys, types
 sys.modules["milx"] = types.ModuleType("milx")  # so that its own imports do not count

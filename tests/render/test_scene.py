@@ -75,6 +75,7 @@ def test_colors_and_materials_are_those_that_mujoco_draws(model, data):
         np.testing.assert_allclose(renderer._materials[i], expected, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_vmap_equals_a_loop(model, data):
     renderer = Renderer(model, "fixed", 24, 30, shadows=True)
     scene = renderer.scene(data)
@@ -124,6 +125,7 @@ def with_mesh(group: int) -> mujoco.MjModel:
         <geom size=".1"/><geom name="odd" type="mesh" mesh="m" group="{group}"/></worldbody></mujoco>""")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("group", "seen"), [(0, {-1, 1}), (3, {-1, 0})])
 def test_a_mesh_is_seen_unless_it_is_in_a_hidden_group(group, seen):
     model = with_mesh(group)

@@ -70,6 +70,7 @@ def textured(seed):
     return renderer, dataclasses.replace(scene, texture=texture)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 def test_kernel_paints_the_textures_of_the_reference(seed):
     renderer, scene = textured(seed)
@@ -83,6 +84,7 @@ def test_kernel_paints_the_textures_of_the_reference(seed):
     assert (np.abs(frame.color - plain.color).max(axis=-1) > 0.02)[covered].mean() > 0.2
 
 
+@pytest.mark.slow
 def test_a_texture_moves_with_the_whole_scene():
     """Turns and shifts objects, camera and textures together: the image stays the same."""
     renderer, scene = textured(0)

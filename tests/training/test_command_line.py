@@ -90,6 +90,7 @@ def test_flags_that_do_not_belong_together_end_with_a_message(train, argument, m
     assert message in process.stderr and "Traceback" not in process.stderr
 
 
+@pytest.mark.slow
 def test_the_first_line_says_what_is_done_and_how_long_it_took(train, tmp_path):
     (tmp_path / "run").write_text("a file, so that no run begins")
     said = train("--env=reach", "--preset=cpu", "--seed=3", "--workdir=run").stdout.splitlines()[0]
@@ -115,6 +116,7 @@ def test_a_method_has_no_settings_of_another(train):
     assert "network.fc_layers" in said and "network.kernel" not in said
 
 
+@pytest.mark.slow
 def test_a_package_of_ones_own_is_found(tmp_path, monkeypatch):
     """Installs a distribution that names its module as a plugin: its environment and its method have flags."""
     (tmp_path / "mine.py").write_text(
@@ -175,6 +177,7 @@ def test_help_shows_the_flags_and_their_choices(train):
     assert "meta-trains a policy on them, and evaluates it" in said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("variables", "message"),
     [

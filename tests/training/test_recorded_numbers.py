@@ -85,6 +85,7 @@ def test_data_that_are_not_finite_are_refused_by_name(tmp_path):
         run._load()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("value", [1e25, -3e15, np.inf, np.nan])
 def test_numbers_whose_squares_are_not_finite_are_refused(cache, tmp_path, value):
     def change(action):

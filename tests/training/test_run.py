@@ -101,6 +101,7 @@ def test_training_changes_the_parameters_but_not_the_whitening(trained):
     np.testing.assert_allclose(items["params"]["whitening"].state_mean, mean, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_fixed_first_layer_is_made_from_what_the_training_demonstrations_show_first(trained):
     config = tiny_config()
     config.network.fixed_filters = "kmeans"

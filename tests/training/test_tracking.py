@@ -22,6 +22,7 @@ def tracker(tmp_path, monkeypatch):
     return lambda: Tracker(tmp_path, config)
 
 
+@pytest.mark.slow
 def test_a_run_that_goes_on_hands_all_its_lines_to_the_same_run_of_wandb(tmp_path, tracker):
     reports = []
     for first in (1, 2):

@@ -45,6 +45,7 @@ def test_one_iteration_solves_lq_as_riccati_does(lqs, stacked_lqs):
         np.testing.assert_allclose(plans.gains[i], gains, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_coarse_model_lead_to_nearly_the_optimal_cost(lqs):
     # Errors of 3% in A and B: the cost of what is found, in the true dynamics, misses the optimum by their square.
     error = np.random.default_rng(7).uniform(-0.03, 0.03, (2, 4, 4))

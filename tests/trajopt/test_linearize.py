@@ -60,6 +60,7 @@ def mujoco_step(model, x, u, substeps):
     return np.concatenate([data.qpos, data.qvel])
 
 
+@pytest.mark.slow
 def test_euler_step_matches_transition_fd(trajectory):
     model = mujoco.MjModel.from_xml_string(ARM.format(integrator="Euler"))
     (A, B), values = jax.jit(lambda x, u: linearize(mjx_dynamics(model, 1), x, u))(*trajectory)

@@ -43,6 +43,7 @@ def test_what_is_executed_is_what_was_recorded_and_noise(cart, scenes):
     cart_laws.check_that_noise_alone_is_not_recorded(demonstrate, scenes, NOISE)
 
 
+@pytest.mark.slow
 def test_plans_are_made_in_the_approximation_and_executed_in_the_world(cart, scenes):
     """A loop searches in the lighter cart's dynamics, with the candidates of all scenes, and drives the heavier one."""
     task, start = scenes[0][0], jax.tree.map(lambda x: x[0], scenes[1])

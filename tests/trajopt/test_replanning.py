@@ -16,6 +16,7 @@ def float64():
         yield
 
 
+@pytest.mark.slow
 def test_planning_again_costs_less_where_things_turn_out_otherwise():
     """Executes one plan to its end, and replans every second step, under the same disturbances."""
     lq = random_lq(1, T=12, n=3, m=2)

@@ -74,6 +74,7 @@ def test_no_episode_starts_where_a_recorded_demonstration_did(policy):
     assert np.linalg.norm(starts[:, None] - recorded[None], axis=-1).min() > 1e-6
 
 
+@pytest.mark.slow
 def test_worlds_that_fail_cost_their_episodes_and_are_reported(policy):
     began = time.monotonic()
     demo = Demo(state=np.ones((6, 2)), action=np.zeros((6, 2)))
@@ -117,6 +118,7 @@ def test_a_state_that_is_not_finite_costs_its_episode(policy):
     assert re.fullmatch(r"the state is \[nan nan\], expected finite numbers", outcomes[0].lost)
 
 
+@pytest.mark.slow
 def test_a_world_that_loses_every_episode_ends_the_evaluation(policy):
     demo = Demo(state=np.ones((6, 2)), action=np.zeros((6, 2)))
     tasks = [Task("near/right", "", (demo,))]
@@ -127,6 +129,7 @@ def test_a_world_that_loses_every_episode_ends_the_evaluation(policy):
         evaluate_in(wide, "point_world:make", tasks, controls=["own"], episodes=12, workers=2)
 
 
+@pytest.mark.slow
 def test_nothing_is_left_of_a_world_when_the_process_that_evaluates_is_told_to_stop(tmp_path):
     """Sends SIGTERM while a world hangs that has started a process: both have ended soon after."""
     program = """
