@@ -46,6 +46,8 @@ def main(argv: list[str]) -> None:
     load_plugins()
     path = pathlib.Path(argv[1]) / "config.json"
     with command():
+        if _DATA.value is not None and _GYM.value is None:
+            raise ValueError(f"data: got {_DATA.value!r} without --gym, expected the world in which to try its tasks")
         if not path.is_file():
             raise ValueError(f"run: {path.parent} has no config.json, expected a folder of `python -m milx.train`")
         platform.require_device()

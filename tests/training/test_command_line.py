@@ -215,6 +215,20 @@ def stopped(name, function, arguments):
     module.main(["milx", *(argument for argument in arguments if not argument.startswith("--"))])
 
 
+def evaluated(*arguments):
+    """Calls `main` of the launcher that evaluates."""
+    module = importlib.import_module("milx.evaluate")
+    module.main(flags.FLAGS(["milx.evaluate", *arguments]))
+
+
+def test_another_data_set_is_tried_in_a_world_only(forks, capfd):
+    process = forks.Process(target=evaluated, args=("run", "--data=later"))
+    process.start()
+    process.join(60)
+    assert process.exitcode == 1
+    assert "data: got 'later' without --gym, expected the world" in capfd.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("name", "function", "arguments"),
     [
