@@ -13,7 +13,7 @@ writes gym.json, and gym.gif where the policy sees images. `milx/worlds/worker.p
 be like; it runs in processes of its own, which need NumPy, Gymnasium and your code alone (--python).
 
 The third one does the same with all tasks of another data set, which should be new to the policy; your own expert may
-have recorded it in that world (`milx.worlds.record`).
+have recorded it in that world (`milx.worlds.record`). It writes gym-new_tasks.json and gym-new_tasks.gif.
 """
 
 import pathlib

@@ -56,8 +56,9 @@ def test_the_blocks_of_a_how_to_run(path, tmp_path, monkeypatch, cache, registri
 def test_the_commands_for_demonstrations_of_ones_own_run(tmp_path, cache):
     """Runs them one after the other, with shorter training, on LeRobot's and robomimic's files of the tests."""
     page = DOCS / "how_to" / "your_own_demonstrations.md"
-    (world,) = (block for block in blocks(page, "python") if block.startswith("# my_world.py"))
-    (tmp_path / "my_world.py").write_text(world)
+    for block in blocks(page, "python"):
+        if file := re.match(r"# (\w+\.py)\n", block):
+            (tmp_path / file[1]).write_text(block)
     scope = {"__name__": "__main__"}
     (writes,) = (block for block in blocks(page, "python") if "with Writer(" in block)
     with contextlib.chdir(tmp_path):
@@ -80,6 +81,8 @@ def test_the_commands_for_demonstrations_of_ones_own_run(tmp_path, cache):
     assert ran == 11
     found = json.loads((tmp_path / "runs" / "demos" / "gym.json").read_text())["controls"]
     assert found["replay"]["ever"] > found["random"]["ever"]
+    found = json.loads((tmp_path / "runs" / "demos" / "gym-new_tasks.json").read_text())
+    assert found["tasks"] == ["middle/north", "middle/south"]
     assert (tmp_path / "exported_chunks" / "policy.py").is_file()
 
 

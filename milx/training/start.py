@@ -82,10 +82,11 @@ def _of_policy(source: str, learned: dict[str, Any], config: Config) -> tuple[di
     if not drawn:
         return found, ""
     if drawn[0] in arrays:
-        fields = _CONVOLUTIONS if convolutions else _DENSE
-        expected = f"{_differences(theirs, config, fields)}, as {source} has"
+        differing = _differences(theirs, config, _CONVOLUTIONS if convolutions else _DENSE)
+        expected = f"{', '.join(differing) or 'states and actions of the same sizes'}, as {source} has"
     elif any(name.startswith(f"{drawn[0].partition('.vision_')[0]}.vision.") for name in arrays):
-        expected = f"network.share_encoder=True, as {source} sees one camera"
+        differing = ["network.share_encoder=True", *_differences(theirs, config, _CONVOLUTIONS)]
+        expected = f"{', '.join(differing)}, as {source} has one encoder"
     else:
         expected = f"the same method, cameras and layers: {source} has no {drawn[0]}"
     if not found.keys() & kernels:
@@ -101,16 +102,12 @@ def _kernels(arrays: dict[str, Any], axes: int) -> list[str]:
     return [name for name, array in arrays.items() if name.endswith(".kernel") and array.ndim >= axes]
 
 
-def _differences(theirs: Config, config: Config, fields: tuple[str, ...]) -> str:
-    """Lists those of the fields in which another configuration differs, with its values.
-
-    Where none does, the sizes of states and actions are the cause.
-    """
+def _differences(theirs: Config, config: Config, fields: tuple[str, ...]) -> list[str]:
+    """Lists those of the fields in which another configuration differs, with its values."""
     mine, other = assemble.fields(config), assemble.fields(theirs)
     if fields == _CONVOLUTIONS and len(mine["network.filters"]) != len(other["network.filters"]):
         fields = (*fields, "network.strides")  # one for each convolution
-    differing = [f"{name}={value}" for name, value in other.items() if name in fields and value != mine.get(name)]
-    return ", ".join(differing) or "states and actions of the same sizes"
+    return [f"{name}={value}" for name, value in other.items() if name in fields and value != mine.get(name)]
 
 
 def _of_file(path: str, learned: dict[str, Any]) -> dict[str, np.ndarray]:

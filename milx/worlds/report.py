@@ -12,9 +12,10 @@ from rich.text import Text
 from milx.config import assemble
 from milx.config.schema import Config
 from milx.core import files, progress
-from milx.core.messages import printable
+from milx.core.messages import printable, warn
+from milx.data.cameras import fitted
 from milx.data.dataset import DataSet
-from milx.deploy.policy import load_run
+from milx.deploy.policy import Policy, load_run
 from milx.evaluation import provenance
 from milx.evaluation.intervals import wilson_interval
 from milx.evaluation.plots import side_by_side
@@ -24,7 +25,7 @@ from milx.worlds.evaluate import evaluate_in, tasks_of
 from milx.worlds.slot import Outcome, Task
 
 FILE, VIDEO = "gym.json", "gym.gif"
-"""The files in the run's folder."""
+"""The files in the run's folder; those of another data set, NAME, are gym-NAME.json and gym-NAME.gif."""
 _FILMED = 3
 """Tasks in the video."""
 
@@ -37,32 +38,38 @@ def report_on(
     data: str | None = None,
     **options: Any,
 ) -> None:
-    """Evaluates a run on the test tasks of its data set, or on all of another one's; writes FILE and VIDEO.
+    """Evaluates a run on the test tasks of its data set, or on all of another one's; prints a table, writes the files.
 
     Args:
         config: of the run.
         folder: the run's.
         make: "module:function", which makes the world.
         console: where to report.
-        data: the folder of another data set, recorded in this world, say; by default it is the run's.
+        data: the folder of another data set; by default it is the run's.
         **options: further arguments of `evaluate_in`.
 
     Raises:
-        ValueError: if the run is not on recorded demonstrations, or as `evaluate_in`.
+        ValueError: if the run is not on recorded demonstrations; if no task has enough demonstrations, or one of
+            another data set's does not fit the policy. Also as `evaluate_in`.
+        FileError: if a data set cannot be read.
     """
     if not config.recorded.path:
-        raise ValueError(f"gym: {folder} is a run in simulation, expected one on recorded demonstrations (--data)")
+        raise ValueError(f"gym: {folder} is a run in simulation, expected one on recorded demonstrations")
     console, policy = console or Console(), load_run(folder)
-    tasks = tasks_of(DataSet(data), None, policy) if data else tasks_of(DataSet(config.recorded.path), "test", policy)
+    if data is None:
+        tasks, file, video = tasks_of(DataSet(config.recorded.path), "test", policy), FILE, VIDEO
+    else:
+        name = pathlib.Path(data).resolve().name
+        tasks, file, video = _tasks_of_another(data, policy), f"gym-{name}.json", f"gym-{name}.gif"
     with progress.phase(console, f"acting in {make}"):
         outcomes = evaluate_in(policy, make, tasks, film=_FILMED, **options)
     found = summarize(outcomes, tasks)
     files.write_json(
-        folder / FILE,
+        folder / file,
         {
             "world": make,
             "criterion": "info['is_success'] or info['success'], at any time and at the end of an episode",
-            "data": data or config.recorded.path,
+            "data": config.recorded.path if data is None else str(pathlib.Path(data).resolve()),
             "tasks": [task.name for task in tasks],
             "controls": found,
             "lost": losses(outcomes, tasks),
@@ -70,17 +77,38 @@ def report_on(
         }
         | provenance.origin(),
     )
+    console.print(table(found))
+    for loss in losses(outcomes, tasks):
+        console.print(f"lost: {printable(loss)}", markup=False, highlight=False)
     filmed = [outcome for outcome in outcomes if outcome.images]
     if filmed:
         camera = goal_camera(policy.spec.image_shape)
         first = lambda image: image if camera is None else image[camera]  # noqa: E731
-        demos = [np.asarray(first(tasks[outcome.episode.task].demos[0].image)) for outcome in filmed]
+        shown = [fitted(tasks[outcome.episode.task].demos[0].image, policy.spec.image_shape) for outcome in filmed]
+        demos = [np.asarray(first(images)) for images in shown]
         trials = [np.stack([first(image) for image in outcome.images or []]) for outcome in filmed]
         longest = max(map(len, demos + trials))
-        side_by_side(_same_length(demos, longest), _same_length(trials, longest), folder / VIDEO)
-    console.print(table(found))
-    for loss in losses(outcomes, tasks):
-        console.print(f"lost: {printable(loss)}", markup=False, highlight=False)
+        side_by_side(_same_length(demos, longest), _same_length(trials, longest), folder / video)
+
+
+def _tasks_of_another(folder: str, policy: Policy) -> list[Task]:
+    """Lists all tasks of a data set on which the policy was not trained, and says how many have too few demonstrations.
+
+    Raises:
+        ValueError: as `tasks_of`, and for a demonstration that does not fit the policy.
+    """
+    data = DataSet(folder)
+    tasks = tasks_of(data, None, policy)
+    for task in tasks:
+        for demo in task.demos:
+            try:
+                policy.prepared(demo)
+            except ValueError as error:
+                raise ValueError(f"data: {folder}, task {task.name}: {error}") from error
+    if left_out := len(data.header.tasks) - len(tasks):
+        expected = f"{policy.config.evaluation.shots} demonstrations that the policy can be adapted to"
+        warn(f"data: {left_out} of the {len(data.header.tasks)} tasks of {folder} are left out, expected {expected}")
+    return tasks
 
 
 def summarize(outcomes: Sequence[Outcome], tasks: Sequence[Task]) -> dict[str, Any]:

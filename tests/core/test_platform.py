@@ -35,7 +35,6 @@ def test_an_import_changes_nothing_and_says_nothing():
     assert run(STATE) == (0, "", "")
 
 
-@pytest.mark.slow
 def test_configured_in_time_an_environment_is_content(tmp_path):
     program = (
         STATE

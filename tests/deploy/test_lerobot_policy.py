@@ -75,7 +75,6 @@ def acted(policy, demo, episode):
     return np.stack([actor.act(seen, [Outcome(first)] * len(seen)) for seen in episode])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("is_exported", [False, True], ids=["loaded", "exported"])
 def test_a_batch_acts_as_in_worlds(policy, demos, tmp_path, is_exported):
     """Compares two episodes after one demonstration, and one after another demonstration."""

@@ -71,7 +71,6 @@ def test_a_data_set_keeps_every_camera_and_what_it_says_of_itself(folder, demos)
             jax.tree.map(np.testing.assert_array_equal, only.image, jax.tree.map(lambda x: x[[4, 1]], demo.image))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("share", [False, True])
 def test_features_are_those_of_each_camera_side_by_side(share):
     """Computes the first layer by hand from each camera's convolutions."""

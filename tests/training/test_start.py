@@ -150,23 +150,25 @@ def test_the_settings_that_a_message_names_make_all_convolutions_fit(source, cap
 
 
 @pytest.mark.parametrize(
-    ("history", "image_shape", "said"),
+    ("history", "kernel", "image_shape", "said"),
     [
-        (2, (64, 64), "1 of the 4 kernels of convolutions, which need recorded.history=1, as push has"),
+        (2, 5, (64, 64), "1 of the 4 kernels of convolutions, which need recorded.history=1, as push has"),
         (
             1,
+            3,
             {"left": (64, 64), "right": (64, 64)},
-            "8 of the 8 kernels of convolutions, which need network.share_encoder=True, as push sees one camera",
+            "8 of the 8 kernels of convolutions, which need network.share_encoder=True, network.kernel=5, as push has "
+            "one encoder",
         ),
     ],
 )
-def test_convolutions_that_have_other_channels_or_names_are_told(history, image_shape, said, capsys):
+def test_convolutions_that_have_other_channels_or_names_are_told(history, kernel, image_shape, said, capsys):
     """Lets a policy with the kernels of push see two observations at once, or two cameras."""
     config = make_config(RECORDED, preset="fast")
-    config.network.kernel, config.recorded.history = 5, history
+    config.network.kernel, config.recorded.history = kernel, history
     start_from("push", shapes_of(config, image_shape), config)
     assert capsys.readouterr().out.endswith(f"; all others are drawn, among them {said}\n")
-    config.network.share_encoder, config.recorded.history = True, 1
+    config.network.share_encoder, config.network.kernel, config.recorded.history = True, 5, 1
     start_from("push", shapes_of(config, image_shape), config)
     assert capsys.readouterr().out.endswith("; all others are drawn\n")
 

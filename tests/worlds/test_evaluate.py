@@ -252,19 +252,32 @@ def test_a_run_is_evaluated_in_the_world_whose_tasks_its_data_set_names(policy, 
     assert found["data"] == str(tmp_path / "set")
 
 
-def test_a_run_is_evaluated_on_all_tasks_of_another_data_set(policy, monkeypatch, tmp_path):
-    """The other one has tasks of all splits, and the run's own, which does not exist, is not read."""
+def test_a_run_is_evaluated_on_all_tasks_of_another_data_set(policy, monkeypatch, tmp_path, capsys):
+    """The other one has tasks of all splits, one of them without actions. The run's own one does not exist."""
     with Writer(tmp_path / "later", None, 2, 2, "a test") as writer:
         for name, split in (("near/left", "train"), ("far/right", "validation"), ("near/right", "test")):
             shown = point_world.PointWorld(name).demonstrate(7)
             writer.add(name, split, [point_world.LENGTH], [Demo(**shown)])
+        writer.add("far/left", "test", [point_world.LENGTH], [Demo(None, shown["state"])])
     policy.config.recorded.path = str(tmp_path / "missing")
     monkeypatch.setattr(report, "load_run", lambda folder: policy)
     options = {"episodes": 3, "workers": 2, "data": str(tmp_path / "later")}
     report.report_on(policy.config, tmp_path, "point_world:make", Console(file=io.StringIO()), **options)
-    found = json.loads((tmp_path / "gym.json").read_text())
+    found = json.loads((tmp_path / "gym-later.json").read_text())
+    assert "data: 1 of the 4 tasks of" in capsys.readouterr().err
     assert (found["data"], found["tasks"]) == (options["data"], ["near/left", "far/right", "near/right"])
     assert {name: found["controls"][name]["end"] for name in ("own", "same_family")} == {"own": 1.0, "same_family": 0.0}
+
+
+def test_a_task_of_another_data_set_that_does_not_fit_is_named(policy, monkeypatch, tmp_path):
+    with Writer(tmp_path / "later", None, 3, 2, "a test") as writer:
+        writer.add("near/left", "test", [4], [Demo(None, np.zeros((4, 3), np.float32), np.zeros((4, 2), np.float32))])
+    policy.config.recorded.path = str(tmp_path / "missing")
+    monkeypatch.setattr(report, "load_run", lambda folder: policy)
+    with pytest.raises(ValueError, match=r"data: .*later, task near/left: demo\.state: got .*, expected"):
+        report.report_on(
+            policy.config, tmp_path, "point_world:make", Console(file=io.StringIO()), data=str(tmp_path / "later")
+        )
 
 
 def test_the_video_shows_the_demonstration_beside_the_trial(policy, monkeypatch, tmp_path):
