@@ -215,18 +215,19 @@ def stopped(name, function, arguments):
     module.main(["milx", *(argument for argument in arguments if not argument.startswith("--"))])
 
 
-def evaluated(*arguments):
-    """Calls `main` of the launcher that evaluates."""
+def evaluated(errors, *arguments):
+    """Calls `main` of the launcher that evaluates, and writes what it says of errors to a file."""
     module = importlib.import_module("milx.evaluate")
+    sys.stderr = errors.open("w")  # to which Python writes the last words of a process, too
     module.main(flags.FLAGS(["milx.evaluate", *arguments]))
 
 
-def test_another_data_set_is_tried_in_a_world_only(forks, capfd):
-    process = forks.Process(target=evaluated, args=("run", "--data=later"))
+def test_another_data_set_is_tried_in_a_world_only(forks, tmp_path):
+    process = forks.Process(target=evaluated, args=(tmp_path / "errors", "run", "--data=later"))
     process.start()
     process.join(60)
     assert process.exitcode == 1
-    assert "data: got 'later' without --gym, expected the world" in capfd.readouterr().err
+    assert "data: got 'later' without --gym, expected the world" in (tmp_path / "errors").read_text()
 
 
 @pytest.mark.parametrize(
