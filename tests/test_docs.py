@@ -24,6 +24,17 @@ def blocks(path, language):
     return re.findall(rf"^```{language}\n(.*?)^```", path.read_text(), re.MULTILINE | re.DOTALL)
 
 
+def write_modules(path, folder):
+    """Writes a page's blocks that begin with the name of a file, and returns its other blocks of Python."""
+    rest = []
+    for block in blocks(path, "python"):
+        if file := re.match(r"# (\w+\.py)\n", block):
+            (folder / file[1]).write_text(block)
+        else:
+            rest.append(block)
+    return rest
+
+
 @pytest.fixture
 def registries():
     """Forgets afterwards what the how-tos register."""
@@ -45,22 +56,16 @@ def registries():
 def test_the_blocks_of_a_how_to_run(path, tmp_path, monkeypatch, cache, registries):
     monkeypatch.chdir(tmp_path)
     scope = {"__name__": "__main__"}
-    for block in blocks(path, "python"):
-        if file := re.match(r"# (\w+\.py)\n", block):
-            (tmp_path / file[1]).write_text(block)
-        else:
-            exec(compile(block, path.name, "exec"), scope)
+    for block in write_modules(path, tmp_path):
+        exec(compile(block, path.name, "exec"), scope)
 
 
 @pytest.mark.slow
 def test_the_commands_for_demonstrations_of_ones_own_run(tmp_path, cache):
     """Runs them one after the other, with shorter training, on LeRobot's and robomimic's files of the tests."""
     page = DOCS / "how_to" / "your_own_demonstrations.md"
-    for block in blocks(page, "python"):
-        if file := re.match(r"# (\w+\.py)\n", block):
-            (tmp_path / file[1]).write_text(block)
     scope = {"__name__": "__main__"}
-    (writes,) = (block for block in blocks(page, "python") if "with Writer(" in block)
+    (writes,) = (block for block in write_modules(page, tmp_path) if "with Writer(" in block)
     with contextlib.chdir(tmp_path):
         exec(compile(writes, page.name, "exec"), scope)
     tasks = {f"lift/demo_{i}": f"lift {i}" for i in (0, 1, 2, 10)}
