@@ -55,7 +55,7 @@ def c_model(env, task):
 
 def wanted(task, state):
     """Lists where the hand goes, and how it closes, in each step of a blind grasp: down, up, over the mat, down."""
-    thing, mat = state.qpos[6:9], state.mocap_pos[task.target]
+    thing, mat = state.qpos[5:8], state.mocap_pos[task.target]
     low, way = thing.at[2].set(0.006), mat.at[2].set(0.1)
     phases = [(thing.at[2].set(0.06), 12, -1), (low, 8, -1), (low, 5, 1), (thing.at[2].set(0.1), 8, 1)]
     phases += [(way, 14, 1), (mat.at[2].set(0.05), 6, 1), (mat.at[2].set(0.05), 7, -1)]
@@ -63,10 +63,9 @@ def wanted(task, state):
 
 
 def act(state, goal):
-    """Moves towards a place without turning."""
-    speed = 8 * (jnp.append(goal[:3], 0.0) - state.qpos[:4])
-    scale = jnp.array([grasp.MAX_SPEED] * 3 + [grasp.MAX_TURN])
-    return jnp.clip(jnp.append(speed / scale, goal[3]), -1, 1)
+    """Moves towards a place."""
+    speed = 8 * (goal[:3] - state.qpos[:3])
+    return jnp.clip(jnp.append(speed / grasp.MAX_SPEED, goal[3]), -1, 1)
 
 
 @pytest.fixture(scope="module")
@@ -113,8 +112,8 @@ def test_the_hand_and_what_lies_on_the_table_move_as_in_mujoco(env, tasks, start
 @pytest.mark.slow
 def test_a_grasp_lifts_as_many_things_as_in_mujoco(env, tasks, starts, shown):
     """Counts lifted things: how a grasp goes on after its first contact depends on the last digit."""
-    expected = [in_c(env, first(tasks, n), first(starts, n))[32, 8] > 0.06 for n in range(len(tasks.target))]
-    found = shown.qpos[:, 32, 8] > 0.06
+    expected = [in_c(env, first(tasks, n), first(starts, n))[32, 7] > 0.06 for n in range(len(tasks.target))]
+    found = shown.qpos[:, 32, 7] > 0.06
     assert min(np.mean(expected), found.mean()) > 0.8
     assert abs(np.mean(expected) - found.mean()) < 0.15
 
@@ -130,8 +129,8 @@ def test_success_needs_an_open_hand_and_a_thing_that_lies_still_on_the_mat(env, 
     place = state.mocap_pos[task.target].at[2].add(env.resting(task))
 
     def judged(thing, finger, speed=0.0):
-        qpos = state.qpos.at[6:9].set(thing).at[4].set(finger)
-        last = dataclasses.replace(state, qpos=qpos, qvel=state.qvel.at[8].set(speed))
+        qpos = state.qpos.at[5:8].set(thing).at[3].set(finger)
+        last = dataclasses.replace(state, qpos=qpos, qvel=state.qvel.at[7].set(speed))
         return bool(env.success(task, jax.tree.map(lambda x: x[None], last)))
 
     assert judged(place, 0.04)
@@ -148,54 +147,53 @@ def test_the_hand_moves_as_its_controls_say_and_returns_to_its_path(env, tasks, 
     model, steering = c_model(env, task), env.steering
     data = mujoco.MjData(model)
     data.qpos[:] = start.qpos
-    velocity = np.array([0.05, -0.1, 0.05, 1.0])
-    controls = np.append(velocity / np.array([grasp.MAX_SPEED] * 3 + [grasp.MAX_TURN]), 0.0)
+    velocity = np.array([0.05, -0.1, 0.05])
+    controls = np.append(velocity / grasp.MAX_SPEED, 0.0)
     data.ctrl[:] = steering.action(start, jnp.asarray(controls))
     mujoco.mj_step(model, data, nstep=30)
-    np.testing.assert_allclose(data.qvel[:4], velocity, rtol=0.02)
-    assert data.qpos[4] > grasp.OPEN, "the fingers are open at 0"
-    away = np.array([0.02, -0.01, 0.01, 0.1])
-    expected = dataclasses.replace(start, qpos=jnp.asarray(data.qpos) + jnp.pad(away, (0, env.mj_model.nq - 4)))
-    data.qvel[:4] = 0
+    np.testing.assert_allclose(data.qvel[:3], velocity, rtol=0.02)
+    assert data.qpos[3] > grasp.OPEN, "the fingers are open at 0"
+    away = np.array([0.02, -0.01, 0.01])
+    expected = dataclasses.replace(start, qpos=jnp.asarray(data.qpos) + jnp.pad(away, (0, env.mj_model.nq - 3)))
+    data.qvel[:3] = 0
     for _ in range(20):
         state = dataclasses.replace(start, qpos=jnp.asarray(data.qpos))
         data.ctrl[:] = steering.action(state, steering.correction(state, expected))
         mujoco.mj_step(model, data)
-    left = (np.asarray(expected.qpos) - data.qpos)[:4] / away
+    left = (np.asarray(expected.qpos) - data.qpos)[:3] / away
     np.testing.assert_allclose(left, np.exp(-20 * model.opt.timestep * grasp.TRACKING), atol=0.06)
 
 
 def test_the_cost_is_what_its_weights_say(env, tasks, starts):
-    """Compares with NumPy, early and late, far from the mat and on it, tilted and moving; derivatives are finite."""
-    task, state, action = first(tasks), first(starts), jnp.linspace(-1, 1, 5)
-    for place in (state.qpos[6:9], state.mocap_pos[task.target] + jnp.array([0.03, 0.04, 0.1])):
-        for t in (0, env.horizon - grasp.LET_GO, env.horizon - grasp.LEAVE, env.horizon - 1):
-            qpos = state.qpos.at[6:9].set(place).at[4].set(0.01).at[9:13].set(np.array([0.5, 0.1, -0.7, 0.5]))
-            qvel = jnp.linspace(-0.5, 0.5, 12)
-            off = np.asarray(place - state.mocap_pos[task.target] - jnp.array([0, 0, env.resting(task)]))
-            away = np.hypot(*off[:2])
-            carried = np.interp(away, (grasp.NEAR, grasp.FAR), (0.0, grasp.CARRIED))
-            opened = grasp.OPEN_COST * (0.045 - 0.01) * (t >= env.horizon - grasp.LET_GO)
-            expected = [*grasp.THING_COST * off[:2], grasp.HEIGHT_COST * (off[2] - carried), opened]
-            leaving = t >= env.horizon - grasp.LEAVE
-            over = np.array([0, 0, grasp.RETREAT * leaving])
-            expected += [*grasp.HAND_COST * (np.asarray(qpos[:3] - place) - over), 0.1, -0.7]
-            expected += [*leaving * np.asarray(qvel[6:9]), *0.03 * leaving * np.asarray(qvel[9:])]
-            expected += [*0.02 * np.asarray(action)]
-            at = dataclasses.replace(state, qpos=qpos, qvel=qvel)
-            np.testing.assert_allclose(env.running_residual(task, at, action, t), expected, atol=5e-5)
+    """Compares with NumPy, tilted and moving, far from the mat, over it, near it and on it; derivatives are finite."""
+    task, state, action = first(tasks), first(starts), jnp.linspace(-1, 1, 4)
+    rest = state.mocap_pos[task.target].at[2].add(env.resting(task))
+    spots = ((0.03, 0.04, 0.1), (0.03, 0.01, 0.003), (0.02, 0.01, 0.007), (0.02, 0.01, 0.005))
+    for place, placed in ((state.qpos[5:8], 0), *zip(rest + jnp.array(spots), (0, 0, 0, 1), strict=True)):
+        qpos = state.qpos.at[5:8].set(place).at[3].set(0.01).at[8:12].set(np.array([0.5, 0.1, -0.7, 0.5]))
+        qvel = jnp.linspace(-0.5, 0.5, 11)
+        off = np.asarray(place - rest)
+        carried = np.interp(np.hypot(*off[:2]), (grasp.NEAR, grasp.FAR), (0.0, grasp.CARRIED))
+        closed = grasp.OPEN_COST * (0.045 - 0.01 * placed)
+        expected = [*grasp.THING_COST * off[:2], grasp.HEIGHT_COST * (off[2] - carried), closed]
+        over = np.array([0, 0, grasp.RETREAT * placed])
+        expected += [*grasp.HAND_COST * (np.asarray(qpos[:3] - place) - over), 0.1, -0.7]
+        expected += [*placed * np.asarray(qvel[5:8]), *0.03 * placed * np.asarray(qvel[8:])]
+        expected += [*0.02 * np.asarray(action)]
+        at = dataclasses.replace(state, qpos=qpos, qvel=qvel)
+        np.testing.assert_allclose(env.running_residual(task, at, action, 0), expected, atol=5e-5)
     slope = jax.jacfwd(lambda qpos: env.running_residual(task, dataclasses.replace(state, qpos=qpos), action, 0))
-    on_mat = state.qpos.at[6:9].set(state.mocap_pos[task.target])
+    on_mat = state.qpos.at[5:8].set(state.mocap_pos[task.target])
     assert np.isfinite(slope(on_mat)).all()
 
 
 @pytest.mark.slow
 def test_things_rest_where_they_are_laid(follow, tasks, starts):
-    """Leaves the open hand where it is for half a second: nothing moves by more than 1 mm or 1 mrad."""
+    """Leaves the open hand where it is for half a second: neither thing nor hand moves by more than 1 mm."""
     here = jnp.insert(starts.qpos[:, :3], 3, -1.0, axis=1)
     after = follow(tasks, starts, jnp.repeat(here[:, None], 60, axis=1)).qpos[:, 9]
-    assert np.abs(after[:, 6:9] - starts.qpos[:, 6:9]).max() < 1e-3
-    assert np.abs(after[:, :4] - starts.qpos[:, :4]).max() < 1e-3
+    assert np.abs(after[:, 5:8] - starts.qpos[:, 5:8]).max() < 1e-3
+    assert np.abs(after[:, :3] - starts.qpos[:, :3]).max() < 1e-3
 
 
 def test_scenes_keep_their_distances(env, tasks, starts):

@@ -41,8 +41,8 @@ SUNK, ROLLING = 0.004, 2e-4
 ON_MAT, RESTING, STILL, OPEN = 0.05, 0.008, 0.05, 0.025
 """What success allows: distances from the mat's center and from the height at which things rest (m), speed (m/s), and
 the least opening of a finger (m)."""
-LET_GO, LEAVE = 15, 11
-"""In this number of steps at the end of the episode the hand is to open, and to leave a thing that lies still."""
+PLACED = 0.03, 0.006
+"""How near the mat's center, and how low over its place there, the hand is to open, and to leave the thing (m)."""
 THING_COST, HEIGHT_COST, HAND_COST, OPEN_COST = 3.0, 15.0, 3.0, 10.0
 """Weights of the residuals (1/m)."""
 SPEED_COST, SPIN_COST, TILT_COST = 1.0, 0.03, 1.0
@@ -52,12 +52,12 @@ CARRIED, NEAR, FAR = 0.07, 0.024, 0.104
 it is to come down, and to lie where it is nearer than NEAR."""
 RETREAT = 0.06
 """How high over the thing the hand is to leave it (m)."""
-MAX_SPEED, MAX_TURN = 0.5, 3.0
-"""What an action of 1 asks of the hand: m/s and rad/s."""
+MAX_SPEED = 0.5
+"""What an action of 1 asks of the hand (m/s)."""
 TRACKING = 6.0
 """Rate at which the hand returns to its path (1/s)."""
-_HAND, _FINGER, _THING = slice(0, 4), 4, slice(6, 9)  # entries of qpos, and of qvel
-_TILT, _MOTION = slice(10, 12), slice(6, 12)  # entries of qpos; entries of qvel
+_HAND, _FINGER, _THING = slice(0, 3), 3, slice(5, 8)  # entries of qpos, and of qvel
+_TILT, _MOTION = slice(9, 11), slice(5, 11)  # entries of qpos; entries of qvel
 _CANDIDATES = 256
 _GRAIN = 1e-3
 
@@ -89,9 +89,8 @@ class GraspTask:
 class Grasp(Env[GraspTask]):
     """A hand moved by velocities, a free thing, three mats, 100x90 pixels, 60 actions of 0.05 s.
 
-    The robot's state is 10-dimensional: the hand's x, y and z (m), its turn about z (rad), how far a finger is open
-    (m), and their velocities. An action is the hand's velocity and turning, in [-1, 1] for MAX_SPEED and MAX_TURN, and
-    how the fingers close, from -1, open, to 1.
+    The robot's state is 8-dimensional: the hand's x, y and z, how far a finger is open (m), and their velocities. An
+    action is the hand's velocity, in [-1, 1] for MAX_SPEED, and how the fingers close, from -1, open, to 1.
     """
 
     name = "grasp"
@@ -103,7 +102,7 @@ class Grasp(Env[GraspTask]):
     goal_indices = (0, 1)
     ahead = 20
     action_cost = 0.02
-    version = 3
+    version = 4
 
     def __init__(self, image_shape: tuple[int, int] | None = None):
         super().__init__(_build(), image_shape)
@@ -150,7 +149,7 @@ class Grasp(Env[GraspTask]):
         hand = jax.random.uniform(hand_key, (3,), minval=jnp.array(HAND_LOW), maxval=jnp.array(HAND_HIGH))
         opened = self.mj_model.jnt_range[_FINGER, 1]
         thing = jnp.stack([*place, self.resting(task), jnp.cos(half), 0.0, 0.0, jnp.sin(half)])
-        qpos = jnp.concatenate([hand, jnp.array([0.0, opened, opened]), thing])
+        qpos = jnp.concatenate([hand, jnp.array([opened, opened]), thing])
         ground = jnp.full((NUM_MATS, 1), SHELF)
         mats = jnp.concatenate([first_spaced(_draw_places(mat_key), SPACING), ground], axis=-1)
         return State(qpos, jnp.zeros(self.mj_model.nv), mats)
@@ -167,14 +166,13 @@ class Grasp(Env[GraspTask]):
 
     @property
     def steering(self) -> Steering:
-        """The actions [5], where 0 opens the fingers; the hand returns to where it is expected."""
-        scale = jnp.array([MAX_SPEED] * 3 + [MAX_TURN])
-        opened, deviation = jnp.array([0, 0, 0, 0, -0.6]), jnp.array([0.3, 0.3, 0.3, 0.1, 0.6])
+        """The actions [4], where 0 opens the fingers; the hand returns to where it is expected."""
+        opened, deviation = jnp.array([0, 0, 0, -0.6]), jnp.array([0.3, 0.3, 0.3, 0.6])
 
         def correction(state: State, expected: State) -> jax.Array:
-            return jnp.pad(TRACKING * (expected.qpos[_HAND] - state.qpos[_HAND]) / scale, (0, 1))
+            return jnp.pad(TRACKING * (expected.qpos[_HAND] - state.qpos[_HAND]) / MAX_SPEED, (0, 1))
 
-        low, high = jnp.array([-1, -1, -1, -1, -0.4]), jnp.array([1, 1, 1, 1, 1.6])
+        low, high = jnp.array([-1, -1, -1, -0.4]), jnp.array([1, 1, 1, 1.6])
         return Steering(low, high, deviation, lambda state, u: u + opened, correction)
 
     @functools.partial(jax.jit, static_argnums=0)
@@ -224,20 +222,21 @@ class Grasp(Env[GraspTask]):
         return state.qpos[_THING] - state.mocap_pos[task.target].at[2].add(self.resting(task))
 
     def running_residual(self, task: GraspTask, state: State, action: jax.Array, t: jax.Array) -> jax.Array:
-        """Returns [20]: how far thing, hand and, at the end, fingers are off; tilt, final speed and action; weighted.
+        """Returns [19]: how far thing, hand and fingers are off; tilt, motion of what is put down, action; weighted.
 
-        The thing's height is compared with that at which it is to be carried, which falls to 0 near the mat, and the
-        hand's place with the thing's, or in the last LEAVE steps with one that is RETREAT higher.
+        The thing's height is compared with that at which it is to be carried, which falls to 0 near the mat. Where the
+        thing is put down, the fingers are to be open and the hand RETREAT over it; elsewhere the hand is to be at the
+        thing, and closed fingers cost as much as open ones, so that putting it down never costs more than holding it.
         """
         *across, up = self.off_target(task, state)
         away = jnp.linalg.norm(jnp.stack(across) + 1e-6)
         carried = CARRIED * jnp.clip((away - NEAR) / (FAR - NEAR), 0.0, 1.0)
-        open_now, leave_now = t >= self.horizon - LET_GO, t >= self.horizon - LEAVE
-        hand = (state.qpos[:3] - state.qpos[_THING]).at[2].add(jnp.where(leave_now, -RETREAT, 0.0))
-        closed = jnp.where(open_now, self.mj_model.jnt_range[_FINGER, 1] - state.qpos[_FINGER], 0.0)
+        placed = (away < PLACED[0]) & (up < PLACED[1])
+        hand = (state.qpos[_HAND] - state.qpos[_THING]).at[2].add(jnp.where(placed, -RETREAT, 0.0))
+        closed = self.mj_model.jnt_range[_FINGER, 1] - jnp.where(placed, state.qpos[_FINGER], 0.0)
         off = [THING_COST * x for x in across] + [HEIGHT_COST * (up - carried), OPEN_COST * closed]
-        moving = jnp.where(leave_now, jnp.array([SPEED_COST] * 3 + [SPIN_COST] * 3), 0.0) * state.qvel[_MOTION]
         tilt = TILT_COST * state.qpos[_TILT]
+        moving = jnp.where(placed, jnp.array([SPEED_COST] * 3 + [SPIN_COST] * 3), 0.0) * state.qvel[_MOTION]
         return jnp.concatenate([jnp.stack(off), HAND_COST * hand, tilt, moving, self.action_cost * action])
 
     def terminal_residual(self, task: GraspTask, state: State) -> jax.Array:
