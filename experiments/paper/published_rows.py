@@ -55,6 +55,7 @@ _NO_IMITATION = {"method.imitation_steps": 0}
 _SHORT = {"train.steps": 5000, "train.eval_every": 1000}
 _PLATEAU = {
     "released": ("the released numbers", RELEASED),
+    "released-long": ("the released numbers, 20,000 updates", RELEASED | {"train.steps": 20_000}),
     "whitened": ("+ whitened actions", _without(RELEASED, *_RAW)),
     "one-rate": (
         "+ whitened actions, the inner rate of the layers before the last",

@@ -1,14 +1,14 @@
-"""How well a network that sees the whole state imitates demonstrations: what a policy of images can hope for.
+"""How well a network that sees the whole state imitates demonstrations.
 
     python experiments/planning/imitate.py --env=grasp --tasks=250,500,1000
-    python experiments/planning/imitate.py --env=push --expert=sampling
+    python experiments/planning/imitate.py --env=push --expert=sampling --batch=512 --tasks=769
     python experiments/planning/imitate.py --env=reach --preset=cpu --tasks=100 --steps=500   # on two cores
 
 The network is told the state, the places of what stands still, and the residuals of the environment's cost, which tell
 the target, and once the time step, too. It learns the actions of the first so many training tasks by least squares.
 Where the time helps, the demonstrations depend on it, and a policy of images and states, which does not know it, cannot
-imitate them. Demonstrations are planned, or read from the cache, as in a run of the preset, and validation tasks are
-those of all runs.
+imitate them. Demonstrations are those of a run of the preset with as many tasks as the largest number, from the cache
+where they are, and validation tasks are those of all runs.
 """
 
 import dataclasses
@@ -55,10 +55,10 @@ class Network(nn.Module):
 
 
 def observe(env: Env, timed: bool, task: Task, state: State, t: jax.Array) -> jax.Array:
-    """Returns what the network sees: state, places, residuals without an action at time 0, and the time (s/10)."""
+    """Returns what the network sees: state, places, residuals without an action at time 0, and the time step."""
     residual = env.running_residual(task, state, jnp.zeros(env.action_size), jnp.int32(0))
     seen = [state.vector, state.mocap_pos.ravel(), residual]
-    return jnp.concatenate([*seen, t[None] / 10.0] if timed else seen)
+    return jnp.concatenate([*seen, t[None]] if timed else seen)
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
@@ -88,21 +88,21 @@ def fit(network: Network, features: jax.Array, actions: jax.Array, steps: int, s
     optimizer = optax.adamw(optax.cosine_decay_schedule(RATE, steps), weight_decay=1e-4)
     params = network.init(init_key, features[0])
 
-    def loss(params: Params, rows: jax.Array) -> jax.Array:
-        off = (answer(network, params, features[rows]) - actions[rows]) / network.actions[1]
-        return jnp.square(off).mean()
+    def loss(params: Params, features: jax.Array, actions: jax.Array) -> jax.Array:
+        return jnp.square((answer(network, params, features) - actions) / network.actions[1]).mean()
 
-    def update(carry: tuple, key: jax.Array) -> tuple[tuple, None]:
-        params, state = carry
-        gradient = jax.grad(loss)(params, jax.random.randint(key, (BATCH,), 0, len(features)))
-        change, state = optimizer.update(gradient, state, params)
-        return (optax.apply_updates(params, change), state), None
+    @jax.jit
+    def train(start: tuple, features: jax.Array, actions: jax.Array, keys: jax.Array) -> Params:
+        def update(carry: tuple, key: jax.Array) -> tuple[tuple, None]:
+            params, state = carry
+            rows = jax.random.randint(key, (BATCH,), 0, len(features))
+            gradient = jax.grad(loss)(params, features[rows], actions[rows])
+            change, state = optimizer.update(gradient, state, params)
+            return (optax.apply_updates(params, change), state), None
 
-    start = params, optimizer.init(params)
-    (params, _), _ = jax.jit(lambda start, keys: jax.lax.scan(update, start, keys))(
-        start, jax.random.split(draw_key, steps)
-    )
-    return params
+        return jax.lax.scan(update, start, keys)[0][0]
+
+    return train((params, optimizer.init(params)), features, actions, jax.random.split(draw_key, steps))
 
 
 def attempt(env: Env, timed: bool, network: Network, params: Params, task: Task, scene: State) -> jax.Array:
@@ -145,7 +145,9 @@ def main(_: list[str]) -> None:
     if _EXPERT.value:
         config.data.expert = _EXPERT.value
         config.data.plan_iterations = ITERATIONS[_EXPERT.value] or config.data.plan_iterations
-    env = envs.make(_ENV.value, (16, 16))
+    if _BATCH.value:
+        config.data.plan_batch = _BATCH.value
+    env = envs.of_config(config)
     train, validation = (demos_of_split(env, config, split) for split in ("train", "validation"))
     planned, rows = time.perf_counter() - began, []
     for count in tasks:
@@ -154,18 +156,20 @@ def main(_: list[str]) -> None:
             found = measure(env, timed, part, validation, _TRIALS.value, _STEPS.value, config.seed)
             rows.append({"tasks": count, "time": timed, **found})
             print(f"{count} tasks{', and the time' if timed else ''}: {found['success']:.1%} succeed", flush=True)
-    said: dict[str, Any] = {"env": _ENV.value, "data": dataclasses.asdict(config.data), "steps": _STEPS.value}
+    said: dict[str, Any] = {"env": _ENV.value, "preset": _PRESET.value, "seed": config.seed, "steps": _STEPS.value}
+    said["data"] = dataclasses.asdict(config.data)
     seconds = {"demonstrations": planned, "total": time.perf_counter() - began}
     result = {**said, "validation": float(validation.success.mean()), "rows": rows, "seconds": seconds, **origin}
     folder = pathlib.Path(_OUT.value)
     folder.mkdir(parents=True, exist_ok=True)
-    files.write_json(folder / f"imitate-{_ENV.value}-{config.data.expert}.json", result)
+    files.write_json(folder / f"imitate-{_ENV.value}-{_PRESET.value}-{_EXPERT.value or 'own'}.json", result)
 
 
 if __name__ == "__main__":
     _ENV = flags.DEFINE_enum("env", "grasp", list(envs.ENVS), "Which environment.")
     _PRESET = flags.DEFINE_string("preset", "fast", "Whose demonstrations.")
     _EXPERT = flags.DEFINE_enum("expert", None, list(ITERATIONS), "Who demonstrates; default the preset's.")
+    _BATCH = flags.DEFINE_integer("batch", None, "Demonstrations planned at once; default the preset's.", lower_bound=1)
     _TASKS = flags.DEFINE_list("tasks", ["250", "500", "1000"], "Numbers of training tasks to learn from.")
     _TRIALS = flags.DEFINE_integer("trials", 4, "Trials of each validation task.", lower_bound=1)
     _STEPS = flags.DEFINE_integer("steps", 4000, "Updates of the network.", lower_bound=1)

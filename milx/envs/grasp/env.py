@@ -226,7 +226,7 @@ class Grasp(Env[GraspTask]):
 
         The thing's height is compared with that at which it is to be carried, which falls to 0 near the mat. Where the
         thing is put down, the fingers are to be open and the hand RETREAT over it; elsewhere the hand is to be at the
-        thing, and closed fingers cost as much as open ones, so that putting it down never costs more than holding it.
+        thing, and the fingers cost as much as if they were closed, so that it pays to put the thing down and let go.
         """
         *across, up = self.off_target(task, state)
         away = jnp.linalg.norm(jnp.stack(across) + 1e-6)
