@@ -15,13 +15,14 @@ import dataclasses
 import functools
 import pathlib
 import time
-from typing import Any
+from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import optax
 from absl import app, flags
+from demonstrate import ITERATIONS
 
 import milx
 from milx import envs
@@ -32,26 +33,46 @@ from milx.envs.base import Env, State, Task
 from milx.evaluation import provenance
 from milx.evaluation.closed_loop import trial_scenes
 from milx.evaluation.intervals import wilson_interval
+from milx.methods.whitening import Whitening
+from milx.methods.whitening import fit as fit_whitening
 from milx.training.simulated import demos_of_split, trial_key
 from milx.types import Params
 
-ITERATIONS = {"ilqr": None, "sampling": 8, "receding": 1}
 BATCH, WIDTH, RATE = 1024, 256, 2e-3
 
 
 class Network(nn.Module):
-    """Three hidden layers; features and actions are scaled by the means and deviations [2, F] and [2, A] of a set."""
+    """Three hidden layers."""
 
-    features: jax.Array
-    actions: jax.Array
+    outputs: int
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
-        """Maps features [..., F] to actions [..., A]."""
-        x = (x - self.features[0]) / self.features[1]
+        """Maps whitened features [..., F] to whitened actions [..., A]."""
         for _ in range(3):
             x = nn.gelu(nn.Dense(WIDTH)(x))
-        return self.actions[0] + self.actions[1] * nn.Dense(self.actions.shape[1])(x)
+        return nn.Dense(self.outputs)(x)
+
+
+class Imitator(NamedTuple):
+    """A network that has learned.
+
+    Attributes:
+        whitening: of features and actions, as of states and actions.
+        params: of the network, for whitened features and actions.
+    """
+
+    whitening: Whitening
+    params: Params
+
+    def whitened(self, features: jax.Array) -> jax.Array:
+        """Returns the whitened actions [..., A] for features [..., F]."""
+        network = Network(len(self.whitening.action_mean))
+        return jnp.asarray(network.apply(self.params, self.whitening.state(features)))
+
+    def action(self, features: jax.Array) -> jax.Array:
+        """Returns the actions [..., A] for features [..., F]."""
+        return self.whitening.unwhiten_action(self.whitened(features))
 
 
 def observe(env: Env, timed: bool, task: Task, state: State, t: jax.Array) -> jax.Array:
@@ -72,61 +93,51 @@ def examples(env: Env, timed: bool, demos: DemoSet) -> tuple[jax.Array, jax.Arra
     return seen.reshape(-1, seen.shape[-1]), demos.action.reshape(-1, env.action_size), counts.ravel()
 
 
-def scale(x: jax.Array) -> jax.Array:
-    """Returns mean and standard deviation [2, F] of examples [M, F]."""
-    return jnp.stack([x.mean(axis=0), x.std(axis=0) + 1e-6])
-
-
-def answer(network: Network, params: Params, features: jax.Array) -> jax.Array:
-    """Returns the actions [..., A] that a network answers features [..., F] with."""
-    return jnp.asarray(network.apply(params, features))
-
-
-def fit(network: Network, features: jax.Array, actions: jax.Array, steps: int, seed: int) -> Params:
-    """Minimizes the mean squared error, in units of the actions' deviation, by AdamW with a cosine."""
+@functools.partial(jax.jit, static_argnums=2)
+def fit(features: jax.Array, actions: jax.Array, steps: int, seed: int) -> Imitator:
+    """Minimizes the mean squared error of the whitened actions by AdamW with a cosine."""
     init_key, draw_key = jax.random.split(jax.random.key(seed))
     optimizer = optax.adamw(optax.cosine_decay_schedule(RATE, steps), weight_decay=1e-4)
-    params = network.init(init_key, features[0])
+    whitening = fit_whitening(features, actions, whiten_actions=True)
+    params = dict(Network(actions.shape[1]).init(init_key, features[0]))
 
-    def loss(params: Params, features: jax.Array, actions: jax.Array) -> jax.Array:
-        return jnp.square((answer(network, params, features) - actions) / network.actions[1]).mean()
+    def loss(params: Params, rows: jax.Array) -> jax.Array:
+        found = Imitator(whitening, params).whitened(features[rows])
+        return jnp.square(found - whitening.action(actions[rows])).mean()
 
-    @jax.jit
-    def train(start: tuple, features: jax.Array, actions: jax.Array, keys: jax.Array) -> Params:
-        def update(carry: tuple, key: jax.Array) -> tuple[tuple, None]:
-            params, state = carry
-            rows = jax.random.randint(key, (BATCH,), 0, len(features))
-            gradient = jax.grad(loss)(params, features[rows], actions[rows])
-            change, state = optimizer.update(gradient, state, params)
-            return (optax.apply_updates(params, change), state), None
+    def update(carry: tuple, key: jax.Array) -> tuple[tuple, None]:
+        params, state = carry
+        gradient = jax.grad(loss)(params, jax.random.randint(key, (BATCH,), 0, len(features)))
+        change, state = optimizer.update(gradient, state, params)
+        return (optax.apply_updates(params, change), state), None
 
-        return jax.lax.scan(update, start, keys)[0][0]
-
-    return train((params, optimizer.init(params)), features, actions, jax.random.split(draw_key, steps))
+    (params, _), _ = jax.lax.scan(update, (params, optimizer.init(params)), jax.random.split(draw_key, steps))
+    return Imitator(whitening, params)
 
 
-def attempt(env: Env, timed: bool, network: Network, params: Params, task: Task, scene: State) -> jax.Array:
-    """Acts in one trial and returns whether it succeeds."""
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def attempt(env: Env, timed: bool, imitator: Imitator, task: Task, scenes: State) -> jax.Array:
+    """Acts in the scenes [N, trials] of N tasks and returns [N, trials], whether it succeeds."""
 
-    def step(state: State, t: jax.Array) -> tuple[State, State]:
-        after = env.step(task, state, answer(network, params, observe(env, timed, task, state, t)))
-        return after, after
+    def trial(task: Task, scene: State) -> jax.Array:
+        def step(state: State, t: jax.Array) -> tuple[State, State]:
+            after = env.step(task, state, imitator.action(observe(env, timed, task, state, t)))
+            return after, after
 
-    _, visited = jax.lax.scan(step, scene, jnp.arange(env.horizon, dtype=float))
-    return env.success(task, jax.tree.map(lambda x, rest: jnp.concatenate([x[None], rest]), scene, visited))
+        _, visited = jax.lax.scan(step, scene, jnp.arange(env.horizon, dtype=float))
+        return env.success(task, jax.tree.map(lambda x, rest: jnp.concatenate([x[None], rest]), scene, visited))
+
+    return jax.vmap(jax.vmap(trial, in_axes=(None, 0)))(task, scenes)
 
 
 def measure(env: Env, timed: bool, train: DemoSet, validation: DemoSet, trials: int, steps: int, seed: int) -> dict:
     """Learns from `train`, and returns success in trials and what is left of the variance of each action."""
     features, actions, counts = examples(env, timed, train)
-    features, actions = features[counts], actions[counts]
-    network = Network(scale(features), scale(actions))
-    params = fit(network, features, actions, steps, seed)
+    imitator = fit(features[counts], actions[counts], steps, seed)
     features, actions, counts = examples(env, timed, validation)
-    off = jnp.square(answer(network, params, features) - actions)[counts].mean(axis=0)
+    off = jnp.square(imitator.action(features) - actions)[counts].mean(axis=0)
     scenes = trial_scenes(env, validation.task, trial_key("validation"), trials)
-    run = jax.vmap(functools.partial(attempt, env, timed, network, params), in_axes=(None, 0))
-    success = jax.jit(jax.vmap(run))(validation.task, scenes)
+    success = attempt(env, timed, imitator, validation.task, scenes)
     return {
         "demonstrations": int(train.success.sum()),
         "unexplained": (off / actions[counts].var(axis=0)).tolist(),
@@ -144,7 +155,7 @@ def main(_: list[str]) -> None:
     config.data.tasks = max(tasks)
     if _EXPERT.value:
         config.data.expert = _EXPERT.value
-        config.data.plan_iterations = ITERATIONS[_EXPERT.value] or config.data.plan_iterations
+        config.data.plan_iterations = ITERATIONS[_EXPERT.value]
     if _BATCH.value:
         config.data.plan_batch = _BATCH.value
     env = envs.of_config(config)
