@@ -78,6 +78,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "published-small": lambda: _published("", "small"),
     "published-reach": lambda: _published("reach"),
     "published-push": lambda: _published("push"),
+    "published-plateau": lambda: _published("", "plateau"),
     "published-baselines": lambda: _published("", "baselines"),
     "published-ladder": lambda: _published("", "ladder"),
     "published-relatives": lambda: _published("", "relatives"),

@@ -71,10 +71,14 @@ _PLATEAU = {
         "`paper`, 3 time steps of 64 tasks",
         {"train.support_frames": 3, "train.query_frames": 3, "train.meta_batch": 64},
     ),
-    "at-once": ("`paper`, an expert that moves at once", _AT_ONCE),
-    "at-once-schedule": ("the same without imitation first", _AT_ONCE | _NO_IMITATION),
-    "at-once-whitened": ("+ whitened actions alone, that expert", _AT_ONCE | _without(RELEASED, *_RAW)),
-    "at-once-released": ("the released numbers, that expert", _AT_ONCE | RELEASED),
+    "at-once-released": ("the released numbers, an expert that moves at once", _AT_ONCE | RELEASED),
+    "at-once-released-long": (
+        "the released numbers, that expert, 20,000 updates",
+        _AT_ONCE | RELEASED | {"train.steps": 20_000},
+    ),
+    "at-once-whitened": ("+ whitened actions, that expert", _AT_ONCE | _without(RELEASED, *_RAW)),
+    "at-once-schedule": ("+ LeCun's start, clip, warm-up, cosine, that expert", _AT_ONCE | _NO_IMITATION),
+    "at-once": ("+ imitation first: `paper`, that expert", _AT_ONCE),
 }
 
 _MUON = {"optimizer.name": "muon"}

@@ -86,6 +86,18 @@ def advice(has_inner_step: bool) -> str:
     return f"the policy does not listen: another task's demonstration does as well as its own. Try {remedies}"
 
 
+def warning(found: dict[str, float], done: int, of: int, has_inner_step: bool) -> str | None:
+    """Says what to try if a run does not listen after a fifth of its meta-updates; None otherwise.
+
+    Args:
+        found: errors of `measure`.
+        done: meta-updates so far, without those that imitate first.
+        of: how many there will be.
+        has_inner_step: whether the method has one.
+    """
+    return advice(has_inner_step) if 5 * done >= of and is_deaf(found) else None
+
+
 def in_words(found: dict[str, float]) -> str:
     """Puts the errors of `measure` into words, to follow a semicolon."""
     parts = [f"{found[name]:.2f} with {words}" for name, words in ERRORS.items() if name in found]

@@ -185,8 +185,9 @@ class Run(abc.ABC):
             metrics.write(step, {f"validation_{name}": value for name, value in values.items()})
             found = "unknown" if score is None else f"{score:.1%}"
             self.console.print(f"step {step}: validation {self.metric} {found}{listening.in_words(heard)}")
-            if 5 * (step - first) >= config.steps - first and listening.is_deaf(heard):
-                self._warn(listening.advice(has_inner_step=hasattr(self.config.method, "inner_lr")))
+            has_inner_step = hasattr(self.config.method, "inner_lr")
+            if warning := listening.warning(heard, step - first, config.steps - first, has_inner_step):
+                self._warn(warning)
             return UNVALIDATED if score is None else score
 
         def save(write: Callable[..., bool], state: TrainState, score: float) -> bool:
