@@ -224,7 +224,8 @@ class TrainConfig:
         frame_exponent: 1 samples time steps evenly, a larger exponent samples more of the beginning of a
             demonstration, where the policy cannot yet see from the robot's own pose where it is going.
         redraw: whenever a task is sampled, give it a new appearance of the training split, and give the distractors in
-            its demonstrations new positions. A few planned demonstrations then stand for many tasks and scenes.
+            its demonstrations new positions; show half of the tasks in a mirror, where the environment has one
+            (`Env.mirror`). A few planned demonstrations then stand for many tasks and scenes.
         log_every: meta-updates in one scan on the device; metrics are logged after every scan.
         eval_every: meta-updates between two validations, each with a checkpoint.
         wandb: a project in Weights & Biases that metrics are sent to, too (`milx.training.tracking`); None for none.

@@ -1,9 +1,13 @@
-"""Random changes of recorded images in training: what was filmed once stands for other views and other lights."""
+"""Changes of demonstrations in training: what was shown once stands for other views, other lights and other sides."""
 
+import dataclasses
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+
+from milx.types import Demo
 
 
 def augmented(image: Any, key: jax.Array, shift: int, recolor: float, crop: int = 0) -> Any:
@@ -36,3 +40,21 @@ def _one_camera(image: jax.Array, key: jax.Array, shift: int, recolor: float, cr
         factor = jax.random.uniform(color_key, (3,), minval=1 - recolor, maxval=1 + recolor)
         image = jnp.clip(jnp.round(image * jnp.tile(factor, image.shape[-1] // 3)), 0, 255).astype(jnp.uint8)
     return image
+
+
+def mirrored(demo: Demo, mirror: tuple[tuple[int, ...], tuple[int, ...]], goal_indices: tuple[int, ...]) -> Demo:
+    """Shows a demonstration in a mirror that swaps the left and the right of its images.
+
+    Args:
+        demo: with states and actions, and goals if there are indices of them; with images of one camera or none.
+        mirror: the signs of the entries of state and action, as `Env.mirror`.
+        goal_indices: the entries of the state that tell the goal.
+    """
+    state, action = map(np.asarray, mirror)
+    return dataclasses.replace(
+        demo,
+        image=None if demo.image is None else demo.image[..., ::-1, :],
+        state=demo.state * state,
+        action=demo.action * action,
+        goal=demo.goal * state[list(goal_indices)],
+    )

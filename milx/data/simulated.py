@@ -16,6 +16,7 @@ from milx.core import files, pytrees
 from milx.core.batching import map_in_chunks
 from milx.core.messages import warn
 from milx.data import experts
+from milx.data.augment import mirrored
 from milx.data.frames import frame_indices
 from milx.data.goals import goals
 from milx.envs.base import Env, State, Task
@@ -178,7 +179,8 @@ def sample_batch(
         shots: K, support demonstrations; one more of the same task becomes the query.
         support_frames: time steps drawn from each support demonstration; None for all.
         query_frames: time steps drawn from the query demonstration; None for all.
-        redraw: show a task in a new appearance of the training split, and each of its demonstrations in a new scene.
+        redraw: show a task in a new appearance of the training split, each of its demonstrations in a new scene, and
+            half of the tasks in a mirror, where the environment has one.
         exponent: see `frame_indices`.
     """
     enough = (demos.success.sum(axis=1) > shots).astype(float)
@@ -198,7 +200,12 @@ def sample_batch(
             return states, action, frame_indices(key, action.shape[0], frames, exponent)
 
         shown = [load(chosen[k], jax.random.fold_in(support_key, k), support_frames) for k in range(shots)]
-        *support, query = render_demos(env, task, [*shown, load(chosen[shots], query_key, query_frames)])
+        observed = render_demos(env, task, [*shown, load(chosen[shots], query_key, query_frames)])
+        if redraw and env.mirror is not None:
+            turned = [mirrored(demo, env.mirror, env.goal_indices) for demo in observed]
+            turn = jax.random.bernoulli(jax.random.fold_in(key, 2))
+            observed = jax.tree.map(lambda x, y: jnp.where(turn, y, x), observed, turned)
+        *support, query = observed
         return TaskBatch(
             support=jax.tree.map(lambda *xs: jnp.stack(xs), *support),
             query=jax.tree.map(lambda x: x[None], query),

@@ -41,6 +41,8 @@ class Env(World[TaskT]):
             compilers must not fuse (`platform.pixel_options`).
         ahead: time steps that an expert with a receding horizon looks ahead (`milx.trajopt.receding`), at least 1; the
             whole episode where that is shorter.
+        mirror: the signs of the entries of the robot's state [S] and of the action [A] in a mirror that swaps the left
+            and the right of the image, where the mirror image of each world is such a world, too; None otherwise.
         action_cost: weight of the action in the planner's running cost (no unit): the lower, the faster the expert.
         version: raised when tasks, scenes, physics, costs, the steering or the controller change, so that no
             demonstration planned before it is taken for one planned after it.
@@ -56,6 +58,7 @@ class Env(World[TaskT]):
     tactics: tuple[float, ...] = (0.0,)
     long_chain: bool = True
     ahead: int = 15
+    mirror: tuple[tuple[int, ...], tuple[int, ...]] | None = None
     action_cost: float = 1.0
     version: int = 1
 

@@ -286,3 +286,55 @@ def test_what_is_planned_is_what_its_version_says(env, tasks, starts, shown):
     numbers += [np.ravel(cost(tasks, starts, action, time)[:4]) for time in (0, env.horizon - 1)]
     numbers += [action[0], steering.low, steering.high, steering.deviation, np.ravel(shown.qpos[0, [5, 15]])]
     planned.check("grasp", [env.version, VERSION], np.concatenate(numbers), atol=1e-5)
+
+
+def turned(state):
+    """Mirrors what MuJoCo's vectors qpos and qvel hold, left and right swapped."""
+    qpos = np.array([1, -1, 1, 1, 1, 1, -1, 1, 1, -1, 1, -1])  # hand, fingers, thing: place and quaternion
+    qvel = np.array([1, -1, 1, 1, 1, 1, -1, 1, -1, 1, -1])
+    return state[0] * qpos, state[1] * qvel
+
+
+def test_the_mirror_image_of_an_episode_is_an_episode(env, tasks, starts):
+    """Acts in a world and in its mirror image, with the mirrored thing and actions, in C MuJoCo."""
+    task, start, rng = first(tasks), first(starts), np.random.default_rng(0)
+    models = c_model(env, task), c_model(env, task)
+    models[1].geom_pos[:, 1] *= -1
+    models[1].geom_quat[:, [1, 3]] *= -1
+    _, signs = env.mirror
+    worlds = [mujoco.MjData(model) for model in models]
+    begin = np.array(start.qpos), np.zeros(env.mj_model.nv)
+    begin[0][:3] = start.qpos[5:8] + np.array([-0.08, 0.01, 0.0])
+    for data, (qpos, qvel), sign in zip(worlds, (begin, turned(begin)), (1, -1), strict=True):
+        data.qpos[:], data.qvel[:] = qpos, qvel
+        data.mocap_pos[:] = start.mocap_pos * np.array([1, sign, 1])
+    touched = False
+    for _ in range(20):
+        action = np.clip(rng.normal(size=4) * 0.2 + [0.5, 0.1, 0, 0.8], -1, 1)  # pushes the thing with closed fingers
+        for model, data, sign in zip(models, worlds, (np.ones(4), np.array(signs)), strict=True):
+            data.ctrl[:] = action * sign
+            mujoco.mj_step(model, data, env.substeps)
+        touched |= np.abs(worlds[0].qpos[5:8] - begin[0][5:8]).max() > 0.01
+    assert touched
+    # The left finger has the motor, and the right one follows it by a constraint that gives way a little.
+    qpos, qvel = turned((worlds[0].qpos, worlds[0].qvel))
+    np.testing.assert_allclose(worlds[1].qpos, qpos, atol=3e-3)
+    np.testing.assert_allclose(worlds[1].qvel, qvel, atol=0.03)
+    for found, expected in ((qpos, begin[0]), (qvel, begin[1])):
+        assert np.abs(found - expected).max() > 0.05
+
+
+def test_the_robot_s_state_and_the_image_are_mirrored_alike(tasks, starts):
+    """Looks at the hand alone, beside an edge of the table, with the thing and the mats out of sight."""
+    env, task, start = Grasp((90, 100)), first(tasks), first(starts)
+    start = dataclasses.replace(
+        start, qpos=start.qpos.at[5].set(9.0), qvel=start.qvel.at[:4].set(0.3), mocap_pos=start.mocap_pos + 9.0
+    )
+    qpos, qvel = map(jnp.asarray, turned((start.qpos, start.qvel)))
+    other = dataclasses.replace(start, qpos=qpos, qvel=qvel)
+    states, _ = env.mirror
+    np.testing.assert_allclose(env.robot_state(other), env.robot_state(start) * np.array(states), atol=1e-12)
+    image, reflection = (np.asarray(jax.jit(env.render)(task, state), int) for state in (start, other))
+    assert np.abs(image - image[:, ::-1]).max() > 50, "the hand is to one side"
+    different = np.abs(reflection - image[:, ::-1]).max(axis=-1) > 3
+    assert different.mean() < 2e-3, "rounding at edges"
