@@ -87,6 +87,14 @@ def cache(shared):
 
 
 @pytest.fixture(scope="session")
+def quick_path(tmp_path_factory) -> str:
+    """Returns a PYTHONPATH with which processes compile as this one does, without the options for many pixels."""
+    folder = tmp_path_factory.mktemp("python")
+    (folder / "sitecustomize.py").write_text("from milx.core import platform\n\nplatform.pixel_options = dict\n")
+    return os.pathsep.join([str(folder), *filter(None, [os.environ.get("PYTHONPATH")])])
+
+
+@pytest.fixture(scope="session")
 def trained(cache, shared) -> Trained:
     """Plans, trains and evaluates the tiny run in the process that asks first; the others read what it left."""
     with filelock.FileLock(shared / "run.lock"):

@@ -61,10 +61,11 @@ def test_the_blocks_of_a_how_to_run(path, tmp_path, monkeypatch, cache, registri
 
 
 @pytest.mark.slow
-def test_the_commands_for_demonstrations_of_ones_own_run(tmp_path, cache):
+def test_the_commands_for_demonstrations_of_ones_own_run(tmp_path, monkeypatch, cache, quick_path):
     """Runs them one after the other, with shorter training, on LeRobot's and robomimic's files of the tests."""
     page = DOCS / "how_to" / "your_own_demonstrations.md"
     scope = {"__name__": "__main__"}
+    monkeypatch.setenv("PYTHONPATH", quick_path)
     (writes,) = (block for block in write_modules(page, tmp_path) if "with Writer(" in block)
     with contextlib.chdir(tmp_path):
         exec(compile(writes, page.name, "exec"), scope)

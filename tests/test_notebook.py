@@ -21,20 +21,13 @@ import execute as execute_notebook  # noqa: E402
 
 
 @pytest.fixture(scope="module")
-def execute(cache, tmp_path_factory):
+def execute(cache, quick_path, tmp_path_factory):
     """Runs a notebook with so many meta-updates and tasks; returns it with its outputs."""
-
-    # As conftest.py does in its own process: the options for drawing many pixels make programs compile twice as long.
-    startup = tmp_path_factory.mktemp("ipython") / "profile_default" / "startup"
-    startup.mkdir(parents=True)
-    (startup / "platform.py").write_text(
-        "from milx.core import platform\nplatform.pixel_options = dict\ndel platform\n"
-    )
 
     def run(name, steps, tasks):
         folder = tmp_path_factory.mktemp("notebook")
         with pytest.MonkeyPatch.context() as patch:
-            patch.setenv("IPYTHONDIR", str(startup.parents[1]))
+            patch.setenv("PYTHONPATH", quick_path)
             patch.setenv("TMPDIR", str(folder))
             patch.setenv("MILX_NOTEBOOK_STEPS", str(steps))
             patch.setenv("MILX_NOTEBOOK_TASKS", str(tasks))
