@@ -88,9 +88,15 @@ def cache(shared):
 
 @pytest.fixture(scope="session")
 def quick_path(tmp_path_factory) -> str:
-    """Returns a PYTHONPATH with which processes compile as this one does, without the options for many pixels."""
+    """Returns a PYTHONPATH with which processes compile as this one does, without the options for many pixels.
+
+    They import JAX when they start, but for workers, which need none.
+    """
     folder = tmp_path_factory.mktemp("python")
-    (folder / "sitecustomize.py").write_text("from milx.core import platform\n\nplatform.pixel_options = dict\n")
+    (folder / "sitecustomize.py").write_text(
+        "import sys\n\nif not any(word.endswith('worker.py') for word in sys.orig_argv):\n"
+        "    from milx.core import platform\n\n    platform.pixel_options = dict\n"
+    )
     return os.pathsep.join([str(folder), *filter(None, [os.environ.get("PYTHONPATH")])])
 
 

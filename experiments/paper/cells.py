@@ -221,7 +221,6 @@ class Cells:
 
     def _fit(self, name: str, config: Config, training: Training, checkpoints: Checkpoints) -> Trained:
         env, trainer = self._env(config), self._trainer(config)
-        first = trainer.method.imitation_steps
         evaluation = dataclasses.replace(config.evaluation, shots=config.train.shots)
         validation = self._demos(dataclasses.replace(config, evaluation=evaluation), "validation")
         state, key = initial_state(trainer, config, training)
@@ -239,8 +238,7 @@ class Cells:
             metrics.write(step, losses | {"validation_success": success, **heard})
             said = "".join(f"loss {loss:.3f}, " for loss in losses.values())
             print(f"  {name} {step}: {said}validation {success:.1%}{listening.in_words(heard)}", flush=True)
-            has_inner_step = hasattr(config.method, "inner_lr")
-            if warning := listening.warning(heard, step - first, config.train.steps - first, has_inner_step):
+            if warning := listening.warning(heard, step, config.train.steps, trainer.method):
                 print(f"  {name}: {warning}", flush=True)
             return success
 

@@ -2,7 +2,7 @@
 
     python experiments/paper/published.py --table=results     # what is missing, then the table; --show runs nothing
     python experiments/paper/published.py --table=plateau --rows=released,whitened --seeds=1
-    python experiments/paper/published.py --table=plateau --show --curves=docs/plateau.png
+    python experiments/paper/published.py --table=plateau --show --rows=released,whitened --curves=FILE    # a figure
 
 The other tables are `small` (32x40 pixels), `baselines`, `ladder`, `relatives`, `experts` and `grasp`;
 `published_rows.py` says what each of their rows changes. Stopped and started again it goes on with its last checkpoint.

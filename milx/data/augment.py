@@ -1,4 +1,4 @@
-"""Changes of demonstrations in training: what was shown once stands for other views, other lights and other sides."""
+"""Changes of demonstrations in training: what was shown once stands for other views, lights, and its mirror image."""
 
 import dataclasses
 from typing import Any
@@ -46,7 +46,8 @@ def mirrored(demo: Demo, mirror: tuple[tuple[int, ...], tuple[int, ...]], goal_i
     """Shows a demonstration in a mirror that swaps the left and the right of its images.
 
     Args:
-        demo: with states and actions, and goals if there are indices of them; with images of one camera or none.
+        demo: one demonstration or several, [..., T, ...], with states, actions and goals (of no entries if there are no
+            indices), and with images of one camera or none.
         mirror: the signs of the entries of state and action, as `Env.mirror`.
         goal_indices: the entries of the state that tell the goal.
     """

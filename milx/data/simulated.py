@@ -186,7 +186,7 @@ def sample_batch(
     enough = (demos.success.sum(axis=1) > shots).astype(float)
 
     def sample_task(key: jax.Array) -> TaskBatch:
-        task_key, demo_key, support_key, query_key = jax.random.split(key, 4)
+        task_key, demo_key, support_key, query_key, mirror_key = jax.random.split(key, 5)
         n = jax.random.choice(task_key, demos.num_tasks, p=enough / enough.sum())
         chosen = jax.random.choice(demo_key, demos.num_demos, (shots + 1,), replace=False, p=demos.success[n] / 1.0)
         task = jax.tree.map(lambda x: x[n], demos.task)
@@ -203,8 +203,7 @@ def sample_batch(
         observed = render_demos(env, task, [*shown, load(chosen[shots], query_key, query_frames)])
         if redraw and env.mirror is not None:
             turned = [mirrored(demo, env.mirror, env.goal_indices) for demo in observed]
-            turn = jax.random.bernoulli(jax.random.fold_in(key, 2))
-            observed = jax.tree.map(lambda x, y: jnp.where(turn, y, x), observed, turned)
+            observed = jax.tree.map(functools.partial(jnp.where, jax.random.bernoulli(mirror_key)), turned, observed)
         *support, query = observed
         return TaskBatch(
             support=jax.tree.map(lambda *xs: jnp.stack(xs), *support),

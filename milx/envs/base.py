@@ -42,7 +42,9 @@ class Env(World[TaskT]):
         ahead: time steps that an expert with a receding horizon looks ahead (`milx.trajopt.receding`), at least 1; the
             whole episode where that is shorter.
         mirror: the signs of the entries of the robot's state [S] and of the action [A] in a mirror that swaps the left
-            and the right of the image, where the mirror image of each world is such a world, too; None otherwise.
+            and the right of the image. Robot, camera, lights, what stands still, the distribution of scenes and
+            `image_to_goal` must be symmetric; what tasks draw need not be, so that a thing's mirror image may have a
+            shape that no task has. None where there is no such mirror.
         action_cost: weight of the action in the planner's running cost (no unit): the lower, the faster the expert.
         version: raised when tasks, scenes, physics, costs, the steering or the controller change, so that no
             demonstration planned before it is taken for one planned after it.

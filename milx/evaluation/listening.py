@@ -86,16 +86,18 @@ def advice(has_inner_step: bool) -> str:
     return f"the policy does not listen: another task's demonstration does as well as its own. Try {remedies}"
 
 
-def warning(found: dict[str, float], done: int, of: int, has_inner_step: bool) -> str | None:
+def warning(found: dict[str, float], step: int, steps: int, method: Method) -> str | None:
     """Says what to try if a run does not listen after a fifth of its meta-updates; None otherwise.
 
     Args:
         found: errors of `measure`.
-        done: meta-updates so far, without those that imitate first.
-        of: how many there will be.
-        has_inner_step: whether the method has one.
+        step: meta-updates so far; the method's `imitation_steps`, which come first, do not count.
+        steps: meta-updates in all, with those.
+        method: what learns.
     """
-    return advice(has_inner_step) if 5 * done >= of and is_deaf(found) else None
+    done, total = step - method.imitation_steps, steps - method.imitation_steps
+    # What has an inner step, and nothing else, can act before it.
+    return advice(has_inner_step="no_demo" in found) if 5 * done >= total and is_deaf(found) else None
 
 
 def in_words(found: dict[str, float]) -> str:

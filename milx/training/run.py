@@ -170,7 +170,7 @@ class Run(abc.ABC):
         return progress.phase(self.console, description, total, done)
 
     def _hooks(self, metrics: MetricsWriter, dataset_hash: str) -> loop.Hooks:
-        config, first = self.config.train, self.method.imitation_steps
+        config = self.config.train
 
         def log(step: int, values: dict[str, float]) -> None:
             metrics.write(step, values)
@@ -185,8 +185,7 @@ class Run(abc.ABC):
             metrics.write(step, {f"validation_{name}": value for name, value in values.items()})
             found = "unknown" if score is None else f"{score:.1%}"
             self.console.print(f"step {step}: validation {self.metric} {found}{listening.in_words(heard)}")
-            has_inner_step = hasattr(self.config.method, "inner_lr")
-            if warning := listening.warning(heard, step - first, config.steps - first, has_inner_step):
+            if warning := listening.warning(heard, step, config.steps, self.method):
                 self._warn(warning)
             return UNVALIDATED if score is None else score
 

@@ -1,11 +1,10 @@
-"""Changes of demonstrations, against what NumPy makes of the same images."""
+"""Random changes of recorded images, against what NumPy makes of the same images."""
 
 import jax
 import numpy as np
 import pytest
 
-from milx.data.augment import augmented, mirrored
-from milx.types import Demo
+from milx.data.augment import augmented
 
 IMAGES = np.random.default_rng(0).integers(0, 200, (3, 8, 9, 3), np.uint8)
 
@@ -70,20 +69,3 @@ def test_images_are_cut_out_at_every_place(shift):
         assert len(fits) == 1
         places.add(fits[0])
     assert len(places) == count**2, "every place, at 1 in 80 for one of 49 to lack by chance, with seeds that are fixed"
-
-
-def test_a_mirror_swaps_left_and_right_and_twice_it_changes_nothing():
-    rng = np.random.default_rng(1)
-    demo = Demo(IMAGES, rng.normal(size=(3, 4)), rng.normal(size=(3, 2)), rng.normal(size=(3, 2)))
-    mirror = (1, -1, -1, 1), (-1, 1)
-    found = mirrored(demo, mirror, (0, 2))
-    for row in range(IMAGES.shape[2]):
-        np.testing.assert_array_equal(found.image[:, :, row], IMAGES[:, :, -1 - row])
-    np.testing.assert_array_equal(
-        found.state, np.stack([-x if i in (1, 2) else x for i, x in enumerate(demo.state.T)], 1)
-    )
-    np.testing.assert_array_equal(found.action, np.stack([-demo.action[:, 0], demo.action[:, 1]], 1))
-    np.testing.assert_array_equal(found.goal, np.stack([demo.goal[:, 0], -demo.goal[:, 1]], 1))
-    jax.tree.map(np.testing.assert_array_equal, mirrored(found, mirror, (0, 2)), demo)
-    blind = mirrored(Demo(None, demo.state, demo.action, demo.goal), mirror, (0, 2))
-    assert blind.image is None

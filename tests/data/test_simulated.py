@@ -10,9 +10,7 @@ import pytest
 
 from milx.core import pytrees
 from milx.data import simulated as demos_lib
-from milx.data.augment import mirrored
 from milx.data.frames import frame_indices
-from milx.types import TaskBatch
 
 MANY = 4
 
@@ -322,28 +320,6 @@ def test_a_redrawn_batch_shows_the_same_demonstrations_in_new_colors_and_places(
         apart = [np.minimum(np.abs(s[n] - o[n]), np.abs(s[n] - ground)) for s, o in zip(seen, other, strict=True)]
         new = [s[n][gap.max(axis=-1) > 20] for s, gap in zip(seen, apart, strict=True)]
         np.testing.assert_allclose(new[0].max(axis=0), new[1].max(axis=0), atol=25)
-
-
-@pytest.mark.slow
-def test_half_of_the_tasks_of_a_redrawn_batch_are_seen_in_a_mirror(trained, monkeypatch):
-    """Expects a task's support and query to be both as they are or both mirrored, with all that belongs to them."""
-    env, keys = trained.run.env, jax.random.split(jax.random.key(7), 12)
-    signs = tuple(np.where(np.arange(env.state_size) % 2, -1, 1).tolist()), (-1, 1)
-    batches = []
-    for mirror in (None, signs):
-        monkeypatch.setattr(env, "mirror", mirror)
-        draw = jax.jit(lambda keys: demos_lib.sample_batch(env, trained.train, keys, 1, 1, 1, redraw=True))
-        batches.append(jax.device_get(draw(keys)))
-    plain, found = batches
-    turned = TaskBatch(*(mirrored(demo, signs, env.goal_indices) for demo in (plain.support, plain.query)), plain.task)
-
-    def same(n, expected):
-        leaves = (jax.tree.leaves(batch) for batch in (found, expected))
-        return all(np.array_equal(x[n], y[n], equal_nan=True) for x, y in zip(*leaves, strict=True))
-
-    kinds = [same(n, turned) for n in range(len(keys))]
-    assert kinds == [not same(n, plain) for n in range(len(keys))]
-    assert 0 < sum(kinds) < len(keys), "one kind alone at 1 in 2,000 by chance"
 
 
 def test_batch_is_a_function_of_the_key(draw):

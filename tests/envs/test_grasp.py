@@ -299,8 +299,9 @@ def test_the_mirror_image_of_an_episode_is_an_episode(env, tasks, starts):
     """Acts in a world and in its mirror image, with the mirrored thing and actions, in C MuJoCo."""
     task, start, rng = first(tasks), first(starts), np.random.default_rng(0)
     models = c_model(env, task), c_model(env, task)
-    models[1].geom_pos[:, 1] *= -1
-    models[1].geom_quat[:, [1, 3]] *= -1
+    drawn = np.isin(env.mj_model.geom_bodyid, env._body)  # the hand is its own mirror image, with exchanged fingers
+    models[1].geom_pos[drawn, 1] *= -1
+    models[1].geom_quat[np.ix_(drawn, [1, 3])] *= -1
     _, signs = env.mirror
     worlds = [mujoco.MjData(model) for model in models]
     begin = np.array(start.qpos), np.zeros(env.mj_model.nv)
@@ -319,7 +320,7 @@ def test_the_mirror_image_of_an_episode_is_an_episode(env, tasks, starts):
     # The left finger has the motor, and the right one follows it by a constraint that gives way a little.
     qpos, qvel = turned((worlds[0].qpos, worlds[0].qvel))
     np.testing.assert_allclose(worlds[1].qpos, qpos, atol=3e-3)
-    np.testing.assert_allclose(worlds[1].qvel, qvel, atol=0.03)
+    np.testing.assert_allclose(worlds[1].qvel, qvel, atol=1e-3)
     for found, expected in ((qpos, begin[0]), (qvel, begin[1])):
         assert np.abs(found - expected).max() > 0.05
 

@@ -80,11 +80,14 @@ def test_errors_are_those_of_a_loop_over_the_tasks(batch, most):
     assert listening.is_deaf(deaf)
 
 
-@pytest.mark.parametrize("other, done, warned", [(1.04, 20, True), (1.06, 20, False), (1.04, 19, False)])
-def test_a_run_that_does_not_listen_is_warned_after_a_fifth(other, done, warned):
+@pytest.mark.parametrize("other, step, warned", [(1.04, 60, True), (1.06, 60, False), (1.04, 59, False)])
+def test_a_run_that_does_not_listen_is_warned_after_a_fifth_of_its_inner_steps(other, step, warned):
     """Warns if another task's demonstration makes the error at most a twentieth larger, as the documentation says."""
-    found = listening.warning({"own_demo": 1.0, "other_demo": other}, done, 100, has_inner_step=True)
+    errors = {"own_demo": 1.0, "other_demo": other}
+    imitates = MIL(MILConfig(imitation_steps=50), CONSTANT)
+    found = listening.warning(errors | {"no_demo": 2.0}, step, 100, imitates)
     assert found == (listening.advice(has_inner_step=True) if warned else None)
+    assert listening.warning(errors, step - 40, 100, Mean()) == (listening.advice(False) if warned else None)
 
 
 def test_an_entry_that_never_changes_has_a_finite_error(batch):

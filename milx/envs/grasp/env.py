@@ -90,7 +90,8 @@ class Grasp(Env[GraspTask]):
     """A hand moved by velocities, a free thing, three mats, 100x90 pixels, 60 actions of 0.05 s.
 
     The robot's state is 8-dimensional: the hand's x, y and z, how far a finger is open (m), and their velocities. An
-    action is the hand's velocity, in [-1, 1] for MAX_SPEED, and how the fingers close, from -1, open, to 1.
+    action is the hand's velocity, in [-1, 1] for MAX_SPEED, and how the fingers close, from -1, open, to 1. In a mirror
+    the fingers are exchanged, which are equally far open but for the give of a constraint.
     """
 
     name = "grasp"
