@@ -21,8 +21,8 @@ def multi_step_loss(losses: jax.Array, progress: jax.Array | float) -> jax.Array
 
 
 def meta_gradient(
-    task_loss: Callable[[Any, Any], jax.Array], params: Any, tasks: Any, at_once: int | None = None
-) -> tuple[Any, jax.Array]:
+    task_loss: Callable[[Any, Any], Any], params: Any, tasks: Any, at_once: int | None = None, has_aux: bool = False
+) -> tuple[Any, Any]:
     """Computes the gradient of the mean over tasks of task_loss(params, task).
 
     Args:
@@ -31,9 +31,11 @@ def meta_gradient(
         tasks: N of them, a pytree whose leaves have this leading axis.
         at_once: how many tasks are worked on at the same time, at most, which bounds memory; None for all. The number
             is the largest divisor of N that is not larger. `tasks_within` finds one for a bound in bytes.
+        has_aux: whether `task_loss` returns a pair, the loss and a pytree of what else is to be known of the task.
 
     Returns:
-        The gradient, as `params`, and the losses [N].
+        The gradient, as `params`, and the losses [N]; with `has_aux` the gradient, and a pair of the losses and what
+        was returned beside them, whose leaves have the leading axis [N].
 
     Raises:
         ValueError: if there is no task, or the leaves have several leading axes; if no task is to be worked on at once;
@@ -43,31 +45,36 @@ def meta_gradient(
     if at_once is not None and at_once < 1:
         raise ValueError(f"at_once: got {at_once}, expected at least 1, or None")
 
-    def of_group(tasks: Any) -> tuple[Any, jax.Array]:
-        def mean_loss(params: Any) -> tuple[jax.Array, jax.Array]:
-            losses = jax.vmap(task_loss, in_axes=(None, 0))(params, tasks)
+    def of_group(tasks: Any) -> tuple[Any, tuple[jax.Array, Any]]:
+        def mean_loss(params: Any) -> tuple[jax.Array, tuple[jax.Array, Any]]:
+            found = jax.vmap(task_loss, in_axes=(None, 0))(params, tasks)
+            losses, aux = found if has_aux else (found, None)
             if not isinstance(losses, jax.Array) or losses.ndim != 1:
                 got = jax.tree.map(lambda x: jnp.shape(x)[1:], losses)
                 raise ValueError(f"task_loss: got what has the shape {got}, expected a scalar")
-            return losses.mean(), losses
+            return losses.mean(), (losses, aux)
 
         return jax.grad(mean_loss, has_aux=True)(params)
 
     if at_once is None or at_once >= count:
-        return of_group(tasks)
+        mean, (losses, aux) = of_group(tasks)
+        return mean, (losses, aux) if has_aux else losses
 
-    def add(total: Any, group: Any) -> tuple[Any, jax.Array]:
-        gradient, losses = of_group(group)
-        return jax.tree.map(lambda total, x: total + x.astype(total.dtype), total, gradient), losses
+    def add(total: Any, group: Any) -> tuple[Any, tuple[jax.Array, Any]]:
+        gradient, found = of_group(group)
+        return jax.tree.map(lambda total, x: total + x.astype(total.dtype), total, gradient), found
 
-    params = jax.tree.map(jnp.asarray, params)
+    params, groups = jax.tree.map(jnp.asarray, params), in_groups(tasks, at_once)
     zeros = jax.tree.map(lambda p: jnp.zeros(p.shape, jnp.promote_types(p.dtype, jnp.float32)), params)
-    total, losses = jax.lax.scan(add, zeros, in_groups(tasks, at_once))
-    mean = jax.tree.map(lambda x, p: (x / len(losses)).astype(p.dtype), total, params)
-    return mean, losses.reshape(count)
+    total, found = jax.lax.scan(add, zeros, groups)
+    losses, aux = jax.tree.map(lambda x: x.reshape(count, *x.shape[2:]), found)
+    mean = jax.tree.map(lambda x, p: (x / len(found[0])).astype(p.dtype), total, params)
+    return mean, (losses, aux) if has_aux else losses
 
 
-def tasks_within(memory: int, task_loss: Callable[[Any, Any], jax.Array], params: Any, tasks: Any) -> int:
+def tasks_within(
+    memory: int, task_loss: Callable[[Any, Any], Any], params: Any, tasks: Any, has_aux: bool = False
+) -> int:
     """Finds the largest number of tasks on which `meta_gradient` can work at the same time within a bound on memory.
 
     Compiles the meta-gradient, from shapes alone, for one number of tasks after the other, from all of them down. The
@@ -78,6 +85,7 @@ def tasks_within(memory: int, task_loss: Callable[[Any, Any], jax.Array], params
         task_loss: as in `meta_gradient`.
         params: arrays, or their shapes (`jax.ShapeDtypeStruct`).
         tasks: N of them, or their shapes.
+        has_aux: as in `meta_gradient`.
 
     Returns:
         `at_once` for `meta_gradient`, a divisor of N.
@@ -89,7 +97,7 @@ def tasks_within(memory: int, task_loss: Callable[[Any, Any], jax.Array], params
     count, shapes = _count(tasks), jax.eval_shape(lambda *x: x, params, tasks)
     needed = 0
     for at_once in (number for number in range(count, 0, -1) if count % number == 0):
-        gradient = jax.jit(functools.partial(meta_gradient, task_loss, at_once=at_once))
+        gradient = jax.jit(functools.partial(meta_gradient, task_loss, at_once=at_once, has_aux=has_aux))
         analysis = gradient.lower(*shapes).compile().memory_analysis()
         assert analysis is not None, "CPUs and GPUs tell"
         needed = analysis.temp_size_in_bytes

@@ -17,9 +17,9 @@ import numpy as np
 import optax
 import optax.contrib
 
+from milx import meta
 from milx.config.schema import OPTIMIZERS, OptimizerConfig, TrainConfig
 from milx.core import parallel, platform
-from milx.core.batching import map_in_groups
 from milx.evaluation import listening
 from milx.methods.base import Method
 from milx.methods.whitening import Whitening
@@ -87,26 +87,25 @@ Loss = Callable[[Params, TaskBatch], tuple[jax.Array, dict[str, jax.Array]]]
 def meta_gradient(loss: Loss, params: Params, batch: TaskBatch) -> tuple[Params, dict[str, jax.Array]]:
     """Computes the gradient of a loss, and its metrics, [N] of each task.
 
-    A CPU works on a few tasks at a time, so that what they need stays in its cache.
+    A CPU works on a few tasks at a time (`meta.meta_gradient`), so that what they need stays in its cache.
 
     Args:
         loss: of a batch of tasks, say `method.loss`.
         params: what it is differentiated by.
         batch: N tasks; all leaves have this leading axis.
     """
-
-    def gradient(batch: TaskBatch) -> tuple[Params, dict[str, jax.Array]]:
+    images = jax.tree.leaves((batch.support.image, batch.query.image))
+    at_once = None
+    if jax.default_backend() == "cpu" and images:
+        at_once = max(_CPU_IMAGES // sum(image.shape[1] * image.shape[2] for image in images), 1)
+    if at_once is None or at_once >= len(batch.query.action):
         return jax.grad(loss, has_aux=True)(params, batch)
 
-    images = jax.tree.leaves((batch.support.image, batch.query.image))
-    if jax.default_backend() != "cpu" or not images:
-        return gradient(batch)
-    at_once = _CPU_IMAGES // sum(image.shape[1] * image.shape[2] for image in images)
-    if at_once >= len(batch.query.action):
-        return gradient(batch)
-    one_task = lambda task: gradient(jax.tree.map(lambda x: x[None], task))  # noqa: E731
-    grad, metrics = map_in_groups(one_task, (batch,), at_once)
-    return jax.tree.map(lambda x: x.mean(axis=0), grad), jax.tree.map(jnp.ravel, metrics)
+    def task_loss(params: Params, task: TaskBatch) -> tuple[jax.Array, dict[str, jax.Array]]:
+        return loss(params, jax.tree.map(lambda x: x[None], task))
+
+    gradient, (_, metrics) = meta.meta_gradient(task_loss, params, batch, at_once, has_aux=True)
+    return gradient, jax.tree.map(jnp.ravel, metrics)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

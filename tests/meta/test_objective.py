@@ -36,6 +36,18 @@ def test_the_meta_gradient_is_the_mean_of_the_tasks_however_many_are_worked_on_a
         np.testing.assert_allclose(found[name], np.mean([grad[name] for _, grad in each], axis=0), rtol=1e-12)
 
 
+@pytest.mark.parametrize("at_once", [None, 2])
+def test_what_a_task_tells_beside_its_loss_is_returned_for_each(at_once):
+    def telling(theta, task):
+        return task_loss(theta, task), {"distance": flat(theta) - task[1]}
+
+    expected = meta.meta_gradient(task_loss, START, (SUPPORT, QUERY))
+    gradient, (losses, told) = meta.meta_gradient(telling, START, (SUPPORT, QUERY), at_once, has_aux=True)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12), (gradient, losses), expected)
+    np.testing.assert_allclose(told["distance"], flat(START) - QUERY, rtol=1e-12)
+    assert meta.tasks_within(10**9, telling, START, (SUPPORT, QUERY), has_aux=True) == len(QUERY)
+
+
 def test_few_tasks_at_once_are_added_up_in_single_precision_at_least():
     """A sum in bfloat16 would stop growing at 256."""
     found, _ = meta.meta_gradient(lambda p, x: (p * x).astype(float), jnp.bfloat16(1), jnp.ones(1024, jnp.bfloat16), 1)
