@@ -1,6 +1,6 @@
 """Grasp, which the paper does not have, by method, with milx's additions; `published.py --table=grasp` has none.
 
-Rows with 1,000 training tasks are the preset's; those with 3,000 show what more demonstrations are worth.
+Rows have the preset's 1,000 training tasks and 20,000 updates, or three times the tasks and twice the updates.
 
     python experiments/paper/grasp.py            # what is missing, then the table
 

@@ -2,7 +2,8 @@
 
     python experiments/planning/film.py --env=grasp --out=docs/grasp.gif
 
-They are those of a run of the preset, from the cache where they are, and planned where they are not.
+They are those of a run of the preset, from the cache where they are, and planned where they are not. Tasks of which a
+demonstration fails are left out.
 """
 
 import pathlib
@@ -17,15 +18,18 @@ from milx.config.assemble import make_config
 from milx.evaluation import closed_loop, plots
 from milx.training.simulated import demos_of_split
 
-TASKS, HEIGHT = 3, 256
+TASKS = 3
+HEIGHT = 256
+"""Of an image (pixels), at most."""
 
 
 def main(_: list[str]) -> None:
     """Writes the film."""
     milx.configure()
     config = make_config(_ENV.value, preset=_PRESET.value)
-    demos = demos_of_split(envs.of_config(config), config, "train")
-    height, width = envs.of_config(config).image_shape
+    env = envs.of_config(config)
+    demos = demos_of_split(env, config, "train")
+    height, width = env.image_shape
     scale = max(1, HEIGHT // height)
     large = envs.make(_ENV.value, (scale * height, scale * width))
     twice = np.flatnonzero(np.asarray(demos.success).all(axis=1))[:TASKS]
@@ -37,7 +41,7 @@ def main(_: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    _ENV = flags.DEFINE_enum("env", "grasp", list(envs.ENVS), "Which environment.")
+    _ENV = flags.DEFINE_enum("env", "grasp", ("reach", "push", "place", "grasp"), "Which environment.")
     _PRESET = flags.DEFINE_string("preset", "fast", "Whose demonstrations.")
     _OUT = flags.DEFINE_string("out", "demonstrations.gif", "The film.")
     app.run(main)

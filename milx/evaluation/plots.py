@@ -102,18 +102,18 @@ def action_errors(metrics: list[dict[str, Any]], evaluation: dict[str, Any], pat
     _save(figure, path)
 
 
-def side_by_side(demo: np.ndarray, trial: np.ndarray, path: pathlib.Path, fps: int = 20) -> None:
-    """Writes an animation: the demonstration on the left, the policy on the right.
+def side_by_side(left: np.ndarray, right: np.ndarray, path: pathlib.Path, fps: int = 20) -> None:
+    """Writes an animation of pairs of films, one pair after the other, say of demonstrations and a policy.
 
     Args:
-        demo: [M, T, H, W, 3] uint8, M demonstrations.
-        trial: [M, T, H, W, 3] uint8, the policy's rollouts on the same tasks.
+        left: [M, T, H, W, 3] uint8.
+        right: [M, T, H, W, 3] uint8.
         path: a .gif file.
         fps: frames per second.
     """
-    gap = np.full((*demo.shape[1:3], 8, 3), 255, np.uint8)
-    clips = [np.concatenate([left, gap, right], axis=2) for left, right in zip(demo, trial, strict=True)]
-    # The last frame stays for half a second before the next task begins.
+    gap = np.full((*left.shape[1:3], 8, 3), 255, np.uint8)
+    clips = [np.concatenate([one, gap, other], axis=2) for one, other in zip(left, right, strict=True)]
+    # The last frame stays for half a second before the next pair begins.
     frames = np.concatenate([np.concatenate([clip, np.repeat(clip[-1:], fps // 2, axis=0)]) for clip in clips])
     with files.replacing(path) as partial:
         iio.imwrite(partial, frames, extension=".gif", duration=1000 / fps, loop=0)

@@ -26,20 +26,21 @@ def meta_gradient(
     """Computes the gradient of the mean over tasks of task_loss(params, task).
 
     Args:
-        task_loss: the loss of one task, a scalar, in which `adapt` or `implicit_adapt` may be called.
+        task_loss: the loss of one task, a scalar, in which `adapt` or `implicit_adapt` may be called; with `has_aux` a
+            pair of it and a pytree of arrays.
         params: what it is differentiated by.
         tasks: N of them, a pytree whose leaves have this leading axis.
         at_once: how many tasks are worked on at the same time, at most, which bounds memory; None for all. The number
             is the largest divisor of N that is not larger. `tasks_within` finds one for a bound in bytes.
-        has_aux: whether `task_loss` returns a pair, the loss and a pytree of what else is to be known of the task.
+        has_aux: whether `task_loss` tells more of a task than its loss, as in `jax.grad`.
 
     Returns:
         The gradient, as `params`, and the losses [N]; with `has_aux` the gradient, and a pair of the losses and what
-        was returned beside them, whose leaves have the leading axis [N].
+        tasks told beside them, whose leaves have the leading axis [N].
 
     Raises:
         ValueError: if there is no task, or the leaves have several leading axes; if no task is to be worked on at once;
-            if a task's loss is no scalar.
+            if a task's loss is no scalar, or with `has_aux` no pair is returned.
     """
     count = _count(tasks)
     if at_once is not None and at_once < 1:
@@ -48,6 +49,8 @@ def meta_gradient(
     def of_group(tasks: Any) -> tuple[Any, tuple[jax.Array, Any]]:
         def mean_loss(params: Any) -> tuple[jax.Array, tuple[jax.Array, Any]]:
             found = jax.vmap(task_loss, in_axes=(None, 0))(params, tasks)
+            if has_aux and not (isinstance(found, tuple) and len(found) == 2):
+                raise ValueError("task_loss: got no pair, expected one with has_aux")
             losses, aux = found if has_aux else (found, None)
             if not isinstance(losses, jax.Array) or losses.ndim != 1:
                 got = jax.tree.map(lambda x: jnp.shape(x)[1:], losses)

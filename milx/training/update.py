@@ -85,7 +85,7 @@ Loss = Callable[[Params, TaskBatch], tuple[jax.Array, dict[str, jax.Array]]]
 
 
 def meta_gradient(loss: Loss, params: Params, batch: TaskBatch) -> tuple[Params, dict[str, jax.Array]]:
-    """Computes the gradient of a loss, and its metrics, [N] of each task.
+    """Computes the gradient of a method's loss, and its metrics.
 
     A CPU works on a few tasks at a time (`meta.meta_gradient`), so that what they need stays in its cache.
 
@@ -93,6 +93,9 @@ def meta_gradient(loss: Loss, params: Params, batch: TaskBatch) -> tuple[Params,
         loss: of a batch of tasks, say `method.loss`.
         params: what it is differentiated by.
         batch: N tasks; all leaves have this leading axis.
+
+    Returns:
+        The gradient of the mean over the tasks, as `params`, and the metrics, [N] each.
     """
     images = jax.tree.leaves((batch.support.image, batch.query.image))
     at_once = None

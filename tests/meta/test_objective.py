@@ -42,10 +42,10 @@ def test_what_a_task_tells_beside_its_loss_is_returned_for_each(at_once):
         return task_loss(theta, task), {"distance": flat(theta) - task[1]}
 
     expected = meta.meta_gradient(task_loss, START, (SUPPORT, QUERY))
-    gradient, (losses, told) = meta.meta_gradient(telling, START, (SUPPORT, QUERY), at_once, has_aux=True)
+    compute = jax.jit(lambda theta: meta.meta_gradient(telling, theta, (SUPPORT, QUERY), at_once, has_aux=True))
+    gradient, (losses, told) = compute(START)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12), (gradient, losses), expected)
     np.testing.assert_allclose(told["distance"], flat(START) - QUERY, rtol=1e-12)
-    assert meta.tasks_within(10**9, telling, START, (SUPPORT, QUERY), has_aux=True) == len(QUERY)
 
 
 def test_few_tasks_at_once_are_added_up_in_single_precision_at_least():
@@ -65,6 +65,7 @@ def test_few_tasks_at_once_are_added_up_in_single_precision_at_least():
             (lambda p, t: flat(p), START, (SUPPORT, QUERY)),
             r"task_loss: got what has the shape \(4,\), expected a scalar",
         ),
+        ((task_loss, START, (SUPPORT, QUERY), None, True), "task_loss: got no pair, expected one with has_aux"),
     ],
 )
 def test_tasks_that_do_not_fit_are_refused(arguments, message):
@@ -156,20 +157,27 @@ def summed(w, x):
     return jnp.square(w).sum() * x.sum() + (jnp.tanh(w) * x.sum()).sum()
 
 
-@pytest.mark.parametrize(("loss", "sizes"), [(wide, (50, 12, 400)), (summed, (10_000, 4, 3))])
-def test_as_many_tasks_are_worked_on_at_once_as_memory_allows(loss, sizes):
+def telling(w, x):
+    return wide(w, x), x
+
+
+@pytest.mark.parametrize(
+    ("loss", "has_aux", "sizes"),
+    [(wide, False, (50, 12, 400)), (telling, True, (50, 12, 400)), (summed, False, (10_000, 4, 3))],
+)
+def test_as_many_tasks_are_worked_on_at_once_as_memory_allows(loss, has_aux, sizes):
     w, x = RNG.normal(size=sizes[0]), RNG.normal(size=sizes[1:])
     needed = {}
     for at_once in (n for n in range(1, len(x) + 1) if len(x) % n == 0):
-        lowered = jax.jit(lambda w, x, n=at_once: meta.meta_gradient(loss, w, x, n)).lower(w, x)
+        lowered = jax.jit(lambda w, x, n=at_once: meta.meta_gradient(loss, w, x, n, has_aux)).lower(w, x)
         needed[at_once] = lowered.compile().memory_analysis().temp_size_in_bytes
     assert len(set(needed.values())) > 1
     for memory in (*needed.values(), max(needed.values()) * 2):
         most = max(n for n, least in needed.items() if least <= memory)
-        assert meta.tasks_within(memory, loss, w, x) == most
+        assert meta.tasks_within(memory, loss, w, x, has_aux) == most
     least = min(needed.values()) - 1
     with pytest.raises(ValueError, match=rf"memory: got {least:,} bytes, expected at least {needed[1]:,}, which one"):
-        meta.tasks_within(least, loss, *jax.eval_shape(lambda *a: a, w, x))
+        meta.tasks_within(least, loss, *jax.eval_shape(lambda *a: a, w, x), has_aux)
 
 
 def test_tasks_of_which_there_are_several_numbers_have_no_bound():
