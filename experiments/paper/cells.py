@@ -263,7 +263,8 @@ class Cells:
         env = self._env(config)
         optimizer = make_optimizer(config.optimizer, config.train.steps)
         method = methods.make(config, env.spec)
-        make = lambda: Trainer(demos_lib.sampler(env, config.train), method, config.train, optimizer)  # noqa: E731
+        sample = demos_lib.sampler(env, config.train, config.method.chunk)
+        make = lambda: Trainer(sample, method, config.train, optimizer)  # noqa: E731
         return self._once(("trainer", self._programs(config)), make)
 
     def _compiling(self, config: Config) -> Future[Callable[..., Any]]:

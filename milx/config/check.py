@@ -22,11 +22,7 @@ def check_config(config: Config) -> None:
     """
     _check_group(config, "")
     recorded = config.recorded
-    for field, value, only in (
-        ("method.chunk", config.method.chunk, 1),
-        ("recorded.history", recorded.history, 1),
-        ("recorded.crop", recorded.crop, 0),
-    ):
+    for field, value, only in (("recorded.history", recorded.history, 1), ("recorded.crop", recorded.crop, 0)):
         if value != only and not recorded.path:
             raise ValueError(f"{field}: got {value}, expected {only} in simulation")
     network = config.network

@@ -170,7 +170,7 @@ class MethodConfig:
         loss_scale: factor by which the errors of the actions are multiplied before they are squared.
         whiten_actions: let the network predict actions that are whitened to zero mean and unit variance.
         goal_weight: weight of the goal head's negative log likelihoods, or of the target head's squared error.
-        chunk: number of time steps whose actions the policy predicts at once; only for recorded demonstrations.
+        chunk: number of time steps whose actions the policy predicts at once.
         execute: number of actions that are executed of a chunk before the next chunk counts; 0 for the mean of what all
             chunks say of a time step (`milx.methods.chunks`).
         given: the parts of a demonstration of a new task that the policy is shown, one of GIVEN. In meta-training,

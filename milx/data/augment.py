@@ -48,7 +48,7 @@ def mirrored(demo: Demo, mirror: tuple[tuple[int, ...], tuple[int, ...]], goal_i
     Args:
         demo: one demonstration or several, [..., T, ...], with states, actions and goals (of no entries if there are no
             indices), and with images of one camera or none.
-        mirror: the signs of the entries of state and action, as `Env.mirror`.
+        mirror: the signs of the entries of state and action, as `Env.mirror`; actions may be chunks.
         goal_indices: the entries of the state that tell the goal.
     """
     state, action = map(np.asarray, mirror)
@@ -56,6 +56,6 @@ def mirrored(demo: Demo, mirror: tuple[tuple[int, ...], tuple[int, ...]], goal_i
         demo,
         image=None if demo.image is None else demo.image[..., ::-1, :],
         state=demo.state * state,
-        action=demo.action * action,
+        action=demo.action * np.tile(action, demo.action.shape[-1] // len(action)),
         goal=demo.goal * state[list(goal_indices)],
     )

@@ -17,7 +17,7 @@ from milx.core.batching import map_in_chunks
 from milx.core.messages import warn
 from milx.data import experts
 from milx.data.augment import mirrored
-from milx.data.frames import frame_indices
+from milx.data.frames import frame_indices, in_chunks
 from milx.data.goals import goals
 from milx.envs.base import Env, State, Task
 from milx.trajopt.expert import choose_tactics, judge, perform
@@ -128,7 +128,9 @@ def _draw(env: Env, key: jax.Array, split: str, num_tasks: int, num_demos: int) 
     return tasks, each, state, jax.random.split(noise_key, total)
 
 
-def render_demo(env: Env, task: Task, states: State, action: jax.Array, index: jax.Array | None = None) -> Demo:
+def render_demo(
+    env: Env, task: Task, states: State, action: jax.Array, index: jax.Array | None = None, chunk: int = 1
+) -> Demo:
     """Observes one demonstration: states with a leading axis T + 1, actions [T, A].
 
     Args:
@@ -137,11 +139,13 @@ def render_demo(env: Env, task: Task, states: State, action: jax.Array, index: j
         states: visited states.
         action: actions taken.
         index: [F] time steps to keep; all T if None.
+        chunk: number C of time steps whose actions each of them holds, [C A].
     """
-    return render_demos(env, task, [(states, action, jnp.arange(len(action)) if index is None else index)])[0]
+    index = jnp.arange(len(action)) if index is None else index
+    return render_demos(env, task, [(states, action, index)], chunk)[0]
 
 
-def render_demos(env: Env, task: Task, demos: list[tuple[State, jax.Array, jax.Array]]) -> list[Demo]:
+def render_demos(env: Env, task: Task, demos: list[tuple[State, jax.Array, jax.Array]], chunk: int = 1) -> list[Demo]:
     """Observes several demonstrations of a task, each of states, actions and time steps to keep, as `render_demo`.
 
     All images are drawn together, so that a program has only one copy of the renderer.
@@ -156,7 +160,7 @@ def render_demos(env: Env, task: Task, demos: list[tuple[State, jax.Array, jax.A
         before = jax.tree.map(lambda x, action=action: x[: len(action)], states)
         robot = jax.vmap(env.robot_state)(before)
         goal = goals(robot, env.goal_indices, env.height_index, env.goal_step)[index]
-        observed.append(Demo(image=image, state=robot[index], action=action[index], goal=goal))
+        observed.append(Demo(image=image, state=robot[index], action=in_chunks(action, chunk)[index], goal=goal))
     return observed
 
 
@@ -169,6 +173,7 @@ def sample_batch(
     query_frames: int | None = None,
     redraw: bool = False,
     exponent: float = 1.0,
+    chunk: int = 1,
 ) -> TaskBatch:
     """Draws tasks and different demonstrations of each that succeed, and renders them.
 
@@ -182,6 +187,7 @@ def sample_batch(
         redraw: show a task in a new appearance of the training split, each of its demonstrations in a new scene, and
             half of the tasks in a mirror, where the environment has one.
         exponent: see `frame_indices`.
+        chunk: see `render_demo`.
     """
     enough = (demos.success.sum(axis=1) > shots).astype(float)
 
@@ -200,7 +206,7 @@ def sample_batch(
             return states, action, frame_indices(key, action.shape[0], frames, exponent)
 
         shown = [load(chosen[k], jax.random.fold_in(support_key, k), support_frames) for k in range(shots)]
-        observed = render_demos(env, task, [*shown, load(chosen[shots], query_key, query_frames)])
+        observed = render_demos(env, task, [*shown, load(chosen[shots], query_key, query_frames)], chunk)
         if redraw and env.mirror is not None:
             turned = [mirrored(demo, env.mirror, env.goal_indices) for demo in observed]
             observed = jax.tree.map(functools.partial(jnp.where, jax.random.bernoulli(mirror_key)), turned, observed)
@@ -214,12 +220,12 @@ def sample_batch(
     return jax.vmap(sample_task)(keys)
 
 
-def sampler(env: Env, train: TrainConfig) -> Callable[[DemoSet, jax.Array], TaskBatch]:
+def sampler(env: Env, train: TrainConfig, chunk: int = 1) -> Callable[[DemoSet, jax.Array], TaskBatch]:
     """Configures `sample_batch` for a run, and returns a function of demonstrations and keys."""
 
     def sample(demos: DemoSet, keys: jax.Array) -> TaskBatch:
         frames = train.support_frames, train.query_frames
-        return sample_batch(env, demos, keys, train.shots, *frames, train.redraw, train.frame_exponent)
+        return sample_batch(env, demos, keys, train.shots, *frames, train.redraw, train.frame_exponent, chunk)
 
     return sample
 

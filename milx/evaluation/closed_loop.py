@@ -60,7 +60,8 @@ def _adaptation(env: Env, method: Method) -> Any:
 
     def adapt_tasks(params: Params, task: Task, states: State, action: jax.Array) -> TaskParams:
         def adapt(task: Task, states: State, action: jax.Array) -> TaskParams:
-            return method.adapt(params, jax.vmap(functools.partial(render_demo, env, task))(states, action))
+            observe = functools.partial(render_demo, env, task, chunk=method.chunk)
+            return method.adapt(params, jax.vmap(observe)(states, action))
 
         return map_in_groups(adapt, (task, states, action), _tasks_at_once(env, action))
 
@@ -159,7 +160,7 @@ def _compare(env: Env, method: Method, params: Params, adapted: TaskParams, demo
     """Measures `listening.compare` on the first demonstration of each of N tasks."""
 
     def render(task: Task, states: State, action: jax.Array) -> Demo:
-        return jax.vmap(functools.partial(render_demo, env, task))(states, action)
+        return jax.vmap(functools.partial(render_demo, env, task, chunk=method.chunk))(states, action)
 
     query = parallel.shard_tasks(jax.vmap(render))(demos.task, demos.states, demos.action)
     return listening.compare(method, params, adapted, query, _tasks_at_once(env, demos.action))

@@ -19,6 +19,7 @@ from milx.config.check import check_config
 from milx.config.schema import Config, EvalConfig
 from milx.core import parallel, platform, pytrees
 from milx.data import simulated as demos_lib
+from milx.data.frames import in_chunks
 from milx.data.simulated import DemoSet
 from milx.envs.base import State, Task
 from milx.evaluation import closed_loop, plots
@@ -80,7 +81,8 @@ def training_on(env: envs.Env, config: Config, train: DemoSet) -> Training:
     most, shots = int(train.success.sum(axis=1).max()), config.train.shots
     if most <= shots:
         raise ValueError(f"data: at most {most} demonstrations of a task succeed, expected more than {shots}")
-    statistics = whitening.fit(_robot_states(env, train.states), train.action, config.method.whiten_actions)
+    action = in_chunks(train.action, config.method.chunk)
+    statistics = whitening.fit(_robot_states(env, train.states), action, config.method.whiten_actions)
 
     def first_images() -> list[np.ndarray]:
         task, states = jax.tree.map(lambda x: x[:128], (train.task, train.states))
@@ -162,7 +164,7 @@ class SimulatedRun(Run):
             raise ValueError(f"data.demos_per_task: got {config.data.demos_per_task}, expected {expected}")
         self.env = envs.of_config(config)
         self._demonstrations: dict[str, dict[str, float]] = {}
-        sample = demos_lib.sampler(self.env, config.train)
+        sample = demos_lib.sampler(self.env, config.train, config.method.chunk)
         super().__init__(config, self.env.spec, sample, workdir, console)
 
     def demos(self, split: str) -> DemoSet:

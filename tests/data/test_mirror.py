@@ -24,6 +24,8 @@ def test_a_mirror_swaps_left_and_right_and_twice_it_changes_nothing():
     np.testing.assert_array_equal(found.action, np.stack([-demo.action[:, 0], demo.action[:, 1]], 1))
     np.testing.assert_array_equal(found.goal, np.stack([demo.goal[:, 0], -demo.goal[:, 1]], 1))
     jax.tree.map(np.testing.assert_array_equal, mirrored(found, mirror, (0, 2)), demo)
+    pairs = mirrored(Demo(None, demo.state, np.tile(demo.action, 2), demo.goal), mirror, (0, 2))
+    np.testing.assert_array_equal(pairs.action, np.tile(found.action, 2))
     blind = mirrored(Demo(None, demo.state, demo.action, demo.goal), mirror, (0, 2))
     assert blind.image is None
 

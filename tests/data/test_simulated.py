@@ -280,6 +280,17 @@ def test_support_and_query_are_different_demonstrations_of_one_task(trained, dra
     assert len(pairs) == 6
 
 
+def test_time_steps_hold_the_actions_of_those_that_follow(trained):
+    """Lets the last action stand for those after the end."""
+    env, keys = trained.run.env, jax.random.split(jax.random.key(9), 2)
+    plain, chunked = (
+        jax.jit(lambda keys, c=c: demos_lib.sample_batch(env, trained.train, keys, 1, chunk=c).query.action)(keys)
+        for c in (1, 3)
+    )
+    later = [np.concatenate([plain[:, :, k:], np.repeat(plain[:, :, -1:], k, axis=2)], axis=2) for k in range(3)]
+    np.testing.assert_array_equal(chunked, np.concatenate(later, axis=-1))
+
+
 def test_only_successful_demonstrations_are_drawn(trained):
     """Lets one demonstration of the first task fail and two of the second, whose third has no partner."""
     success = jnp.ones((8, 3), bool).at[0, 1].set(False).at[1, 1:].set(False)

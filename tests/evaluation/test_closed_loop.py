@@ -17,6 +17,7 @@ from milx.core.batching import map_in_chunks, map_in_groups
 from milx.envs.reach.env import Reach
 from milx.evaluation import closed_loop, intervals
 from milx.methods import Method
+from milx.methods.chunks import Chunked
 from milx.methods.whitening import Whitening
 from milx.training import simulated
 
@@ -105,6 +106,16 @@ def test_table_is_the_same_for_batches_of_two_and_three_and_for_tasks_adapted_on
     assert 0 < three.mean() < 1, "replay succeeds by luck in some scenes"
     np.testing.assert_array_equal(two, three)
     np.testing.assert_array_equal(one_by_one, three)
+
+
+@pytest.mark.slow
+def test_a_demonstration_that_is_repeated_in_chunks_ends_like_one_that_is_repeated_action_by_action(trained):
+    env, key, config = trained.run.env, jax.random.key(5), EvalConfig(trials=4, shots=1, batch=3)
+    plain, chunked = (
+        closed_loop.run_trials(env, method, (), trained.test, config, key).states
+        for method in (Replay(), Chunked(Replay(), 4, 4, env.action_size))
+    )
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), plain, chunked)
 
 
 @pytest.mark.parametrize(("shots", "pixels", "at_once"), [(2, 8000 * 3, 3), (2, 8000 * 3 - 1, 2), (1, 8000 * 3, 6)])

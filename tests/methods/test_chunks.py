@@ -10,7 +10,6 @@ from told import Told
 import milx
 from milx import methods
 from milx.config.assemble import make_config
-from milx.config.check import check_config
 from milx.data.dataset import DataSet, Writer, spread
 from milx.data.frames import in_chunks
 from milx.data.recorded import read_later
@@ -117,7 +116,3 @@ def test_chunks_that_cannot_be_are_refused():
     config.method.chunk, config.method.execute = 2, 3
     with pytest.raises(ValueError, match=r"method\.execute: got 3, expected at most method\.chunk = 2"):
         methods.make(config, Spec(None, 3, 2, None, ()))
-    simulated = make_config("reach", preset="cpu")
-    simulated.method.chunk = 2
-    with pytest.raises(ValueError, match=r"method\.chunk: got 2, expected 1 in simulation"):
-        check_config(simulated)
