@@ -60,9 +60,13 @@ def _runs(name: str, shots: int, found: dict[str, dict[str, Any]]) -> list[dict[
 
 
 def markdown(rows: dict[str, Row], found: dict[str, dict[str, Any]]) -> str:
-    """Writes a table of what there is: the mean of the seeds, their intervals, the paper's number and the baselines."""
-    lines = ["| | success | with another task's | random | task-blind | expert | training | paper |"]
-    lines.append("|---|---|---|---|---|---|---|---|")
+    """Writes a table of what there is: the mean of the seeds, their intervals, the paper's number and the baselines.
+
+    Without a column for the paper's number where no row has one.
+    """
+    head = ["", "success", "with another task's", "random", "task-blind", "expert", "training"]
+    head += ["paper"] if (compared := any(row.published for row in rows.values())) else []
+    lines = [head, ["---"] * len(head)]
     for name, row in rows.items():
         columns = [_runs(name, shots, found) for shots in row.shots]
         if not all(columns):
@@ -75,8 +79,8 @@ def markdown(rows: dict[str, Row], found: dict[str, dict[str, Any]]) -> str:
             for baseline in ("other_demo", "random", "task_blind", "expert")
         ]
         seconds = f"{statistics.mean(run['wall_clock_s']['train'] for run in columns[0]):.0f} s"
-        lines.append(f"| {row.label} | {shown} | {' | '.join(baselines)} | {seconds} | {row.published} |")
-    return "\n".join(lines)
+        lines.append([row.label, shown, *baselines, seconds, *([row.published] if compared else [])])
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def draw(rows: dict[str, Row], found: dict[str, dict[str, Any]], path: str) -> None:
