@@ -31,7 +31,7 @@ from milx.core import platform
 from milx.envs.base import Env
 from milx.networks import layers
 from milx.networks.policy_network import PolicyConfig
-from milx.training.update import Loss, meta_gradient
+from milx.training.update import Loss, batch_gradient
 from milx.types import Params, TaskBatch
 
 _OUT = flags.DEFINE_string("out", str(common.RESULTS), "Folder of the JSON file.")
@@ -50,7 +50,7 @@ def domain(name: str) -> tuple[Config, Env]:
 
 
 def compile_gradient(
-    config: Config, env: Env, batch: TaskBatch, gradient: Callable[..., Any] = meta_gradient
+    config: Config, env: Env, batch: TaskBatch, gradient: Callable[..., Any] = batch_gradient
 ) -> tuple[jax.stages.Compiled, Any]:
     """Compiles the meta-gradient, and makes parameters for it."""
     method = methods.make(config, env.spec)
@@ -140,7 +140,7 @@ def measure_domain(name: str) -> None:
         network = dataclasses.replace(config.network, mixed_precision=mixed, rematerialise=rematerialise)
         return dataclasses.replace(config, network=network)
 
-    def gradient(*changes: bool, by: Callable[..., Any] = meta_gradient) -> tuple[float, float]:
+    def gradient(*changes: bool, by: Callable[..., Any] = batch_gradient) -> tuple[float, float]:
         compiled, params = compile_gradient(variant(*changes), env, batch, by)
         return common.median_ms(compiled, params, batch, repeats=repeats), common.gib(compiled)
 

@@ -84,7 +84,7 @@ Loss = Callable[[Params, TaskBatch], tuple[jax.Array, dict[str, jax.Array]]]
 """As `Method.loss`: the mean over a batch of N tasks, and metrics [N]."""
 
 
-def meta_gradient(loss: Loss, params: Params, batch: TaskBatch) -> tuple[Params, dict[str, jax.Array]]:
+def batch_gradient(loss: Loss, params: Params, batch: TaskBatch) -> tuple[Params, dict[str, jax.Array]]:
     """Computes the gradient of a method's loss, and its metrics.
 
     A CPU works on a few tasks at a time (`meta.meta_gradient`), so that what they need stays in its cache.
@@ -179,9 +179,9 @@ class Trainer:
             return self.method.loss(params, batch, jnp.maximum(step - first, 0) / (self.train.steps - first))
 
         if not first:
-            return meta_gradient(meta_objective, params, batch)
+            return batch_gradient(meta_objective, params, batch)
         losses = self.method.imitation, meta_objective
-        branches = [functools.partial(meta_gradient, loss) for loss in losses]
+        branches = [functools.partial(batch_gradient, loss) for loss in losses]
         return jax.lax.cond(step < first, *branches, params, batch)
 
     @functools.partial(jax.jit, static_argnums=(0, 4))

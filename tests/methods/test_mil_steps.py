@@ -183,7 +183,7 @@ def test_meta_gradient_of_a_few_tasks_at_a_time(batch, monkeypatch, tasks_at_onc
     method, params = build()
     images_per_task = STEPS * (1 + 2)
     monkeypatch.setattr(update, "_CPU_IMAGES", tasks_at_once * images_per_task)
-    by_few = functools.partial(update.meta_gradient, method.loss)
+    by_few = functools.partial(update.batch_gradient, method.loss)
     assert "scan" in str(jax.make_jaxpr(by_few)(params, batch)), "the tasks are split"
     found, metrics = jax.jit(by_few)(params, batch)
     (loss, each), gradient = jax.jit(jax.value_and_grad(method.loss, has_aux=True))(params, batch)
