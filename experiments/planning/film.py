@@ -16,11 +16,9 @@ import milx
 from milx import envs
 from milx.config.assemble import make_config
 from milx.evaluation import closed_loop, plots
-from milx.training.simulated import demos_of_split
+from milx.training.simulated import demos_of_split, large
 
 TASKS = 3
-HEIGHT = 256
-"""Of an image (pixels), at most."""
 
 
 def main(_: list[str]) -> None:
@@ -29,19 +27,17 @@ def main(_: list[str]) -> None:
     config = make_config(_ENV.value, preset=_PRESET.value)
     env = envs.of_config(config)
     demos = demos_of_split(env, config, "train")
-    height, width = env.image_shape
-    scale = max(1, HEIGHT // height)
-    large = envs.make(_ENV.value, (scale * height, scale * width))
     twice = np.flatnonzero(np.asarray(demos.success).all(axis=1))[:TASKS]
     task, states = jax.tree.map(lambda x: x[twice], (demos.task, demos.states))
+    camera = large(_ENV.value, env)
     left, right = (
-        np.asarray(closed_loop.film(large, task, jax.tree.map(lambda x, n=n: x[:, n], states))) for n in range(2)
+        np.asarray(closed_loop.film(camera, task, jax.tree.map(lambda x, n=n: x[:, n], states))) for n in range(2)
     )
     plots.side_by_side(left, right, pathlib.Path(_OUT.value))
 
 
 if __name__ == "__main__":
-    _ENV = flags.DEFINE_enum("env", "grasp", ("reach", "push", "place", "grasp"), "Which environment.")
+    _ENV = flags.DEFINE_enum("env", "grasp", list(envs.ENVS), "Which environment.")
     _PRESET = flags.DEFINE_string("preset", "fast", "Whose demonstrations.")
     _OUT = flags.DEFINE_string("out", "demonstrations.gif", "The film.")
     app.run(main)

@@ -37,6 +37,8 @@ VIDEO = "rollouts.gif"
 """The video's file in the run's folder."""
 _FILMED = 3
 """Tasks that it shows."""
+_LARGE = 256
+"""Height of its images (pixels), at most, unless policies see larger ones."""
 
 
 def size_of_split(config: Config, split: str) -> tuple[int, int]:
@@ -62,6 +64,13 @@ def demos_of_split(env: envs.Env, config: Config, split: str) -> DemoSet:
 def trial_key(split: str) -> jax.Array:
     """Draws the trial scenes of a split."""
     return jax.random.fold_in(jax.random.key(EVALUATION_SEED), len(SPLITS) + SPLITS.index(split))
+
+
+def large(name: str, env: envs.Env) -> envs.Env:
+    """Makes the environment of that name with images large enough to look at, whole multiples of those of `env`."""
+    height, width = env.image_shape
+    scale = max(1, _LARGE // height)
+    return envs.make(name, (scale * height, scale * width))
 
 
 def training_on(env: envs.Env, config: Config, train: DemoSet) -> Training:
@@ -247,9 +256,7 @@ class SimulatedRun(Run):
     @functools.cached_property
     def _large(self) -> envs.Env:
         """The environment with images large enough to look at."""
-        height, width = self.env.image_shape
-        scale = max(1, 256 // height)
-        return envs.make(self.config.env_name, (scale * height, scale * width))
+        return large(self.config.env_name, self.env)
 
     def _film(self, test: DemoSet, trials: Trials) -> None:
         """Writes the video: demonstrations beside the first trial of the same held-out tasks, in large."""
