@@ -60,19 +60,19 @@ def meta_gradient(
         return jax.grad(mean_loss, has_aux=True)(params)
 
     if at_once is None or at_once >= count:
-        mean, (losses, aux) = of_group(tasks)
-        return mean, (losses, aux) if has_aux else losses
+        mean, found = of_group(tasks)
+        return mean, found if has_aux else found[0]
 
     def add(total: Any, group: Any) -> tuple[Any, tuple[jax.Array, Any]]:
         gradient, found = of_group(group)
         return jax.tree.map(lambda total, x: total + x.astype(total.dtype), total, gradient), found
 
-    params, groups = jax.tree.map(jnp.asarray, params), in_groups(tasks, at_once)
+    params = jax.tree.map(jnp.asarray, params)
     zeros = jax.tree.map(lambda p: jnp.zeros(p.shape, jnp.promote_types(p.dtype, jnp.float32)), params)
-    total, found = jax.lax.scan(add, zeros, groups)
-    losses, aux = jax.tree.map(lambda x: x.reshape(count, *x.shape[2:]), found)
+    total, found = jax.lax.scan(add, zeros, in_groups(tasks, at_once))
     mean = jax.tree.map(lambda x, p: (x / len(found[0])).astype(p.dtype), total, params)
-    return mean, (losses, aux) if has_aux else losses
+    found = jax.tree.map(lambda x: x.reshape(count, *x.shape[2:]), found)
+    return mean, found if has_aux else found[0]
 
 
 def tasks_within(

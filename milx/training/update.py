@@ -97,17 +97,15 @@ def batch_gradient(loss: Loss, params: Params, batch: TaskBatch) -> tuple[Params
     Returns:
         The gradient of the mean over the tasks, as `params`, and the metrics, [N] each.
     """
-    images = jax.tree.leaves((batch.support.image, batch.query.image))
-    at_once = None
-    if jax.default_backend() == "cpu" and images:
-        at_once = max(_CPU_IMAGES // sum(image.shape[1] * image.shape[2] for image in images), 1)
-    if at_once is None or at_once >= len(batch.query.action):
+    shown = jax.tree.leaves((batch.support.image, batch.query.image))
+    images = sum(x.shape[1] * x.shape[2] for x in shown)  # of each task
+    if jax.default_backend() != "cpu" or images * len(batch.query.action) <= _CPU_IMAGES:
         return jax.grad(loss, has_aux=True)(params, batch)
 
     def task_loss(params: Params, task: TaskBatch) -> tuple[jax.Array, dict[str, jax.Array]]:
         return loss(params, jax.tree.map(lambda x: x[None], task))
 
-    gradient, (_, metrics) = meta.meta_gradient(task_loss, params, batch, at_once, has_aux=True)
+    gradient, (_, metrics) = meta.meta_gradient(task_loss, params, batch, max(_CPU_IMAGES // images, 1), has_aux=True)
     return gradient, jax.tree.map(jnp.ravel, metrics)
 
 
