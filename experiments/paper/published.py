@@ -64,14 +64,14 @@ def markdown(rows: dict[str, Row], found: dict[str, dict[str, Any]]) -> str:
 
     Without a column for the paper's number where no row has one.
     """
-    head = ["", "success", "with another task's", "random", "task-blind", "expert", "training"]
-    head += ["paper"] if (compared := any(row.published for row in rows.values())) else []
+    head = ["", "success", "with another task's", "random", "task-blind", "expert", "training", "paper"]
+    shown = len(head) if any(row.published for row in rows.values()) else len(head) - 1
     lines = [head, ["---"] * len(head)]
     for name, row in rows.items():
         columns = [_runs(name, shots, found) for shots in row.shots]
         if not all(columns):
             continue
-        shown = " / ".join(interval(runs) for runs in columns)
+        success = " / ".join(interval(runs) for runs in columns)
         baselines = [
             f"{statistics.mean(run['baselines'][baseline] for run in columns[0]):.1%}"
             if baseline in columns[0][0]["baselines"]
@@ -79,8 +79,8 @@ def markdown(rows: dict[str, Row], found: dict[str, dict[str, Any]]) -> str:
             for baseline in ("other_demo", "random", "task_blind", "expert")
         ]
         seconds = f"{statistics.mean(run['wall_clock_s']['train'] for run in columns[0]):.0f} s"
-        lines.append([row.label, shown, *baselines, seconds, *([row.published] if compared else [])])
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+        lines.append([row.label, success, *baselines, seconds, row.published])
+    return "\n".join(f"| {' | '.join(line[:shown])} |" for line in lines)
 
 
 def draw(rows: dict[str, Row], found: dict[str, dict[str, Any]], path: str) -> None:
