@@ -101,6 +101,7 @@ def main(_: list[str]) -> None:
     points = _POINTS.value or (2048 if accelerated else 32)
     note, unit = f"{worlds} worlds, nv = {env.mj_model.nv}, {env.mj_model.npair} contact pairs, apart", "substeps/s"
     report.measure("milx, Env.step", unit, lambda: measure_milx(env, worlds), note)
+    report.attempt("milx by Warp, Env.step", unit, lambda: measure_milx(env.by_warp(), worlds), note)
     report.attempt("MJX-JAX, mjx.step", unit, lambda: measure_mjx(env, worlds, "jax"), note)
     report.attempt("MJX-Warp, mjx.step", unit, lambda: measure_mjx(env, worlds, "warp"), note)
     threads = os.cpu_count() or 1

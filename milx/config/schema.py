@@ -11,6 +11,8 @@ from typing import Any
 
 GIVEN = ("video+state+action", "video+state", "video")
 """The parts of a demonstration of a new task that a policy may be shown."""
+PHYSICS = ("jax", "warp")
+"""Who steps the worlds: MJX's implementation in JAX, or MuJoCo Warp (`milx.envs.warp`)."""
 LARGEST_SIZE = 1 << 14
 """Maximum size of a layer. A larger value is most likely a typing error."""
 
@@ -35,11 +37,14 @@ class EnvConfig:
         goal_step: the time step of a demonstration at which the robot is at the goal that a goal head learns to see
             (`milx.data.goals`). None for the environment's own rule: in push where the hand comes down, and elsewhere
             where the demonstration ends.
+        physics: who steps the world, one of PHYSICS. MuJoCo Warp is made for NVIDIA's GPUs and has no derivatives;
+            iLQR plans with MJX all the same. Worlds that integrate by themselves, reach and place, have "jax" alone.
     """
 
     image_shape: tuple[int, int] = number((64, 80), 1, 4096)
     action_cost: float | None = number(None, 0)
     goal_step: int | None = number(None, 1)
+    physics: str = "jax"
 
 
 @dataclasses.dataclass

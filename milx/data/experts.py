@@ -74,8 +74,9 @@ def _check(config: DataConfig) -> None:
 
 def digest(env: Env, *request: Any) -> str:
     """Hashes what was asked of an expert, and all versions that what it plans depends on."""
+    described = [env.name, *request, env.action_cost, *([] if env.physics == "jax" else [env.physics])]
     versions = [jax.default_backend(), jax.__version__, mujoco.__version__, env.version, expert.VERSION]
-    return hashlib.sha256(json.dumps([env.name, *request, env.action_cost, *versions]).encode()).hexdigest()[:16]
+    return hashlib.sha256(json.dumps([*described, *versions]).encode()).hexdigest()[:16]
 
 
 @functools.cache

@@ -5,10 +5,11 @@ task starts in another *scene* (positions), which lives in the state. Both are p
 """
 
 import abc
+import copy
 import dataclasses
 import functools
 import pathlib
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Self, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +19,7 @@ import numpy as np
 from milx.core import platform
 from milx.core.mjx import mjx
 from milx.envs.kinematics import kinematics
+from milx.envs.warp import WarpPhysics
 from milx.render.scene import Renderer
 from milx.render.textures import Textures
 from milx.types import Observation
@@ -85,6 +87,34 @@ class World(abc.ABC, Generic[TaskT]):
             self.image_shape = image_shape
         self.renderer = Renderer(model, self.camera, *self.image_shape)
         self._data = mjx.make_data(self.model, device)
+        self._warp: WarpPhysics | None = None
+
+    @property
+    def differentiable(self) -> Self:
+        """The same world with steps that can be differentiated, by MJX in JAX."""
+        return self._stepped_by(None) if self._warp else self
+
+    @property
+    def physics(self) -> str:
+        """Whose implementation of MJX steps the world, one of `milx.config.schema.PHYSICS`."""
+        return "warp" if self._warp else "jax"
+
+    def by_warp(self) -> Self:
+        """Returns the same world, stepped by MuJoCo Warp.
+
+        Raises:
+            ValueError: for a world that integrates in its own way; as `WarpPhysics`.
+        """
+        if type(self).integrate is not World.integrate:
+            raise ValueError(
+                f"physics: got 'warp', expected 'jax' for {type(self).__name__}, which overrides integrate"
+            )
+        return self._stepped_by(WarpPhysics(self.mj_model, self._data._impl.ncon, self._data._impl.nefc))
+
+    def _stepped_by(self, warp: WarpPhysics | None) -> Self:
+        world = copy.copy(self)
+        world._warp = warp
+        return world
 
     @property
     def action_size(self) -> int:
@@ -163,6 +193,8 @@ class World(abc.ABC, Generic[TaskT]):
         ctrl = jnp.clip(action, *self.action_range)
 
         # Only positions and velocities are carried: MJX's data is large, and the rest follows from them.
+        if self._warp:
+            return state.with_vector(self._warp.advance(model, state.vector, state.mocap_pos, ctrl, substeps))
         x, _ = jax.lax.scan(
             lambda x, _: (self.integrate(model, state.with_vector(x), ctrl), None), state.vector, length=substeps
         )

@@ -30,7 +30,7 @@ taken for one planned after it."""
 
 def plan(env: Env, task: Task, state: State, options: Options) -> Plan:
     """Plans one episode from `state`: iLQR on the environment's costs, started from the environment's guess."""
-    return solve(problem_of(env, task, state), state.vector, env.guess(task, state), options)
+    return solve(problem_of(env.differentiable, task, state), state.vector, env.guess(task, state), options)
 
 
 class Sampling(NamedTuple):
