@@ -10,6 +10,9 @@ import numpy as np
 
 from milx.envs.grasp import env as grasp
 
+CLOSING, LIFTED = 24, 39
+"""The time steps at which the fingers begin to close, and at which the thing has been lifted."""
+
 
 def first(tree, number=0):
     """Takes one of a batch."""
@@ -30,8 +33,9 @@ def wanted(task, state):
     """Lists where the hand goes, and how it closes, in each step of a blind grasp: down, up, over the mat, down."""
     thing, mat = state.qpos[5:8], state.mocap_pos[task.target]
     low, way = thing.at[2].set(0.006), mat.at[2].set(0.1)
-    phases = [(thing.at[2].set(0.06), 12, -1), (low, 8, -1), (low, 5, 1), (thing.at[2].set(0.1), 8, 1)]
-    phases += [(way, 14, 1), (mat.at[2].set(0.05), 6, 1), (mat.at[2].set(0.05), 7, -1)]
+    phases = [(thing.at[2].set(0.06), 16, -1), (low, CLOSING - 16, -1), (low, 5, 1)]
+    phases += [(thing.at[2].set(0.1), LIFTED - CLOSING - 5, 1)]
+    phases += [(way, 25, 1), (mat.at[2].set(0.05), 8, 1), (mat.at[2].set(0.05), 47 - LIFTED, -1)]
     return jnp.stack([jnp.append(place, grip) for place, steps, grip in phases for _ in range(steps)])
 
 
@@ -42,7 +46,7 @@ def act(state, goal):
 
 
 def in_c(env, task, start):
-    """Grasps blindly in C MuJoCo; returns qpos [60, nq]."""
+    """Grasps blindly in C MuJoCo; returns qpos [80, nq]."""
     model = c_model(env, task)
     data = mujoco.MjData(model)
     data.qpos[:], data.mocap_pos[:] = start.qpos, start.mocap_pos

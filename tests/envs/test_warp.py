@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from blind_grasp import act, first, in_c, wanted
+from blind_grasp import CLOSING, LIFTED, act, first, in_c, wanted
 
 import milx
 from milx import envs
@@ -56,7 +56,7 @@ def shown(env, tasks, starts):
 
 @pytest.fixture(scope="module")
 def expected(env, tasks, starts):
-    """Grasps blindly in C MuJoCo: qpos [N, 60, nq]."""
+    """Grasps blindly in C MuJoCo: qpos [N, 80, nq]."""
     return np.stack([in_c(env, first(tasks, n), first(starts, n)) for n in range(SCENES)])
 
 
@@ -67,12 +67,12 @@ def test_the_hand_and_what_lies_on_the_table_move_as_in_mujoco(shown, expected):
     In the first steps things come to rest, and the solvers stop after six iterations, in slightly different places.
     """
     np.testing.assert_allclose(shown.qpos[:, :3], expected[:, :3], atol=5e-3)
-    np.testing.assert_allclose(shown.qpos[:, 3:18], expected[:, 3:18], atol=3e-4)
+    np.testing.assert_allclose(shown.qpos[:, 3:CLOSING], expected[:, 3:CLOSING], atol=3e-4)
 
 
 @pytest.mark.warp
 def test_a_grasp_lifts_as_many_things_as_in_mujoco(shown, expected):
-    lifted, in_mujoco = shown.qpos[:, 32, 7] > 0.06, expected[:, 32, 7] > 0.06
+    lifted, in_mujoco = shown.qpos[:, LIFTED - 1, 7] > 0.06, expected[:, LIFTED - 1, 7] > 0.06
     assert min(np.mean(lifted), np.mean(in_mujoco)) > 0.8
     assert abs(np.mean(lifted) - np.mean(in_mujoco)) < 0.15
 
@@ -80,7 +80,7 @@ def test_a_grasp_lifts_as_many_things_as_in_mujoco(shown, expected):
 @pytest.mark.warp
 def test_steps_do_not_depend_on_how_worlds_are_batched(env, tasks, starts, shown):
     """Steps grasped things: all at once, alone, and each with several actions, which share a task's model."""
-    states = jax.tree.map(lambda x: x[:, 27], shown)
+    states = jax.tree.map(lambda x: x[:, CLOSING + 6], shown)
     actions = jnp.linspace(-0.5, 0.5, 3)[:, None] * jnp.ones(env.action_size)
     several = jax.vmap(jax.vmap(env.step, in_axes=(None, None, 0)), in_axes=(0, 0, None))
     grouped = jax.jit(several)(tasks, states, actions)

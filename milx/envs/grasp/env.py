@@ -43,7 +43,7 @@ ON_MAT, RESTING, STILL, OPEN = 0.05, 0.008, 0.05, 0.025
 the least opening of a finger (m)."""
 PLACED = 0.03, 0.006
 """How near the mat's center, and how low over its place there, the hand is to open, and to leave the thing (m)."""
-THING_COST, HEIGHT_COST, HAND_COST, OPEN_COST = 3.0, 15.0, 3.0, 10.0
+THING_COST, HEIGHT_COST, HAND_COST, OPEN_COST = 3.0, 15.0, 6.0, 10.0
 """Weights of the residuals (1/m)."""
 SPEED_COST, SPIN_COST, TILT_COST = 1.0, 0.03, 1.0
 """Weights of the thing's velocity (s/m) and turning (s/rad), and of the sine of half the angle by which it tilts."""
@@ -52,7 +52,7 @@ CARRIED, NEAR, FAR = 0.07, 0.024, 0.104
 it is to come down, and to lie where it is nearer than NEAR."""
 RETREAT = 0.06
 """How high over the thing the hand is to leave it (m)."""
-MAX_SPEED = 0.5
+MAX_SPEED = 0.3
 """What an action of 1 asks of the hand (m/s)."""
 TRACKING = 6.0
 """Rate at which the hand returns to its path (1/s)."""
@@ -87,7 +87,7 @@ class GraspTask:
 
 
 class Grasp(Env[GraspTask]):
-    """A hand moved by velocities, a free thing, three mats, 100x90 pixels, 60 actions of 0.05 s.
+    """A hand moved by velocities, a free thing, three mats, 100x90 pixels, 80 actions of 0.05 s.
 
     The robot's state is 8-dimensional: the hand's x, y and z, how far a finger is open (m), and their velocities. An
     action is the hand's velocity, in [-1, 1] for MAX_SPEED, and how the fingers close, from -1, open, to 1. In a mirror
@@ -95,7 +95,7 @@ class Grasp(Env[GraspTask]):
     """
 
     name = "grasp"
-    horizon = 60
+    horizon = 80
     substeps = 5
     image_shape = (90, 100)
     camera = "front"
@@ -104,7 +104,7 @@ class Grasp(Env[GraspTask]):
     ahead = 20
     mirror = (1, -1, 1, 1, 1, -1, 1, 1), (1, -1, 1, 1)
     action_cost = 0.02
-    version = 4
+    version = 5
 
     def __init__(self, image_shape: tuple[int, int] | None = None):
         super().__init__(_build(), image_shape)
