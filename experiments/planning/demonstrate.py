@@ -6,7 +6,7 @@
     python experiments/planning/demonstrate.py --envs=grasp --expert=receding --scenes=512
 
 Plans as a run with this `data.expert` does (`milx.data.experts`). With "sampling" the plans with which all scenes begin
-are searched for first, in 512 other scenes. Nothing comes from a cache. No setting was chosen by these scenes. All of
+are searched for first, in 256 other scenes. Nothing comes from a cache. No setting was chosen by these scenes. All of
 them draw the same candidates, so that the intervals are those for this one draw.
 """
 

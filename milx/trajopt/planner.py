@@ -4,9 +4,9 @@ In each scene a search (`sampling.py`) begins with the cheapest of the plans of 
 succeeded, and improves it. The plan is then executed: the robot returns to its path (`Env.steering`) while noise drives
 it off, and every few steps what is left is planned again (`replanning.execute`). Candidates are rolled out by
 `Env.approximate_step`, and what is executed happens by `Env.step`. The nearest scenes are those whose first states have
-the most similar running residuals. The first plans are searched from nothing (`find_plans`); scenes in which that fails
-begin again with those of others (`share_plans`). All scenes that are demonstrated draw the same candidates, so that
-similar scenes are demonstrated alike, and a policy can learn what they have in common.
+the most similar running residuals. The first plans are searched from nothing (`find_plans`); then all of these scenes
+begin again with each other's (`share_plans`), by which cheap plans spread and similar scenes get similar ones. All
+scenes that are demonstrated draw the same candidates, too, so that a policy can learn what they have in common.
 
 Reference:
     Laskey et al., "DART: noise injection for robust imitation learning", CoRL 2017 (the recorded action is the one
@@ -40,8 +40,7 @@ class Settings:
     Attributes:
         scenes: M, in which plans are searched for from nothing, for other scenes to begin with.
         from_nothing: iterations of those searches.
-        rounds: how often, at most, scenes without a plan that succeeded begin again with the plans of others.
-        enough: fraction of scenes with a plan that succeeded at which these rounds stop.
+        rounds: how often these scenes begin again with each other's plans.
         search: how a plan is improved that begins with those of other scenes.
         again: how what is left of a plan is planned again, with a spline of the same order.
         every: number of time steps from one plan to the next. It is the largest divisor of the horizon that is at most
@@ -54,10 +53,9 @@ class Settings:
         ValueError: for a number that is out of range, or splines of two orders.
     """
 
-    scenes: int = 512
+    scenes: int = 256
     from_nothing: int = 24
-    rounds: int = 12
-    enough: float = 0.9
+    rounds: int = 4
     search: Options = SEARCH
     again: Options = AGAIN
     every: int = 5
@@ -71,8 +69,6 @@ class Settings:
                 raise ValueError(f"{field}: got {value}, expected at least 1")
         if self.rounds < 0:
             raise ValueError(f"rounds: got {self.rounds}, expected at least 0")
-        if not 0 <= self.enough <= 1:
-            raise ValueError(f"enough: got {self.enough}, expected 0 to 1")
         if self.near <= 0:
             raise ValueError(f"near: got {self.near}, expected more than 0")
         if self.again.order != self.search.order:
@@ -135,6 +131,11 @@ class Planner:
         """Goes on with a search."""
         options = dataclasses.replace(self.settings.search, iterations=iterations)
         return sampling.solve(self.problem(task, start), start.vector, search, self.env.horizon, key, options)
+
+    def search_from(self, task: Task, start: State, plans: Plans) -> Search:
+        """Searches from the plans of others, with the same candidates in all scenes."""
+        iterations = self.settings.search.iterations
+        return self.improve(task, start, self.begin_from(task, start, plans), jax.random.key(_FIRST), iterations)
 
     def execute(
         self, task: Task, start: State, search: Search, key: jax.Array, noise: jax.Array | float, tracking: bool = True
@@ -204,9 +205,7 @@ def demonstrate(
 
     def one(plans: Plans, noise: jax.Array, task: Task, start: State, key: jax.Array) -> tuple[State, jax.Array]:
         planner = Planner(env, settings)
-        search = planner.begin_from(task, start, plans)
-        search = planner.improve(task, start, search, jax.random.key(_FIRST), settings.search.iterations)
-        return planner.execute(task, start, search, key, noise)
+        return planner.execute(task, start, planner.search_from(task, start, plans), key, noise)
 
     batched = jax.vmap(one, in_axes=(None, None, 0, 0, 0))
     return parallel.shard_tasks(batched, shared=2)(plans, jnp.asarray(noise, float), task, start, key)
@@ -238,25 +237,25 @@ def find_plans(env: Env, settings: Settings, noise: jax.Array | float, key: jax.
 
 
 def share_plans(env: Env, settings: Settings, plans: Plans, noise: jax.Array | float, key: jax.Array) -> Plans:
-    """Lets the scenes of `find_plans` in which no plan succeeded begin again with the plans of others, in rounds.
+    """Lets the scenes of `find_plans` begin again with each other's plans, in rounds.
 
-    Each round plans in all scenes, and keeps what succeeded where nothing had. If no plan has succeeded at all, nothing
-    can begin, and the plans are returned as they are.
+    In each round every scene plans, beginning with the cheapest of the plans of the nearest scenes in which one
+    succeeded, its own among them, and keeps what it finds if that succeeds. Without any plan that succeeded nothing can
+    begin, and the plans are returned as they are.
 
     Args:
         env: the environment.
-        settings: of the planner; `rounds` and `enough` say for how long.
+        settings: of the planner.
         plans: what `find_plans` returned for the other arguments.
         noise: standard deviation of the noise on the actions, in their units.
-        key: draws tasks, scenes, noise, and the candidates of the searches.
+        key: draws tasks, scenes and noise.
 
     Returns:
-        The plans [M]; those that had succeeded are unchanged.
+        The plans [M].
     """
-    for number in range(settings.rounds):
-        if not 0 < plans.success.mean() < settings.enough:
-            break
-        plans = _shared(env, settings, plans, noise, key, jnp.int32(number))
+    if plans.success.any():
+        for number in range(settings.rounds):
+            plans = _shared(env, settings, plans, noise, key, jnp.int32(number))
     return plans
 
 
@@ -267,19 +266,16 @@ def _shared(
     """Runs one round of `share_plans`."""
 
     def one(plans: Plans, noise: jax.Array, number: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        planner, (task, start, *keys) = Planner(env, settings), _drawn(env, key)
-        search_key, key = (jax.random.fold_in(key, 1 + number) for key in keys)
-        search = planner.begin_from(task, start, plans)
-        search = planner.improve(task, start, search, search_key, settings.search.iterations)
-        states, _ = planner.execute(task, start, search, key, noise)
+        planner, (task, start, _, key) = Planner(env, settings), _drawn(env, key)
+        search = planner.search_from(task, start, plans)
+        states, _ = planner.execute(task, start, search, jax.random.fold_in(key, 1 + number), noise)
         return search.knots, env.success(task, states)
 
     keys = jax.random.split(key, parallel.round_up(settings.scenes))
     batched = parallel.shard_tasks(jax.vmap(one, in_axes=(None, None, None, 0)), shared=3)
     found = batched(plans, jnp.asarray(noise, float), number, keys)
     knots, success = jax.tree.map(lambda x: x[: settings.scenes], found)
-    new = success & ~plans.success
-    return plans._replace(knots=jnp.where(new[:, None, None], knots, plans.knots), success=plans.success | new)
+    return plans._replace(knots=jnp.where(success[:, None, None], knots, plans.knots), success=plans.success | success)
 
 
 def _drawn(env: Env, key: jax.Array) -> tuple[Task, State, jax.Array, jax.Array]:
