@@ -30,7 +30,7 @@ from milx.types import SPLITS, Demo
 
 
 class GymEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
-    """An environment of milx. An episode never terminates; it is truncated at the environment's horizon.
+    """An environment of milx, stepped by MJX in JAX. An episode never terminates; it is truncated at the horizon.
 
     Observations are dictionaries with "state", float32 [S], and, if policies see pixels, "image", uint8 [H, W, 3]. The
     reward of a step is minus the experts' running cost. After the last step, `info["is_success"]` says whether the

@@ -7,7 +7,7 @@ import typing
 from collections.abc import Mapping
 from typing import Any
 
-from milx.config.schema import Config, ConvConfig
+from milx.config.schema import PHYSICS, Config, ConvConfig
 
 MOST = 10**9
 """The maximum of integer fields that declare none."""
@@ -25,6 +25,8 @@ def check_config(config: Config) -> None:
     for field, value, only in (("recorded.history", recorded.history, 1), ("recorded.crop", recorded.crop, 0)):
         if value != only and not recorded.path:
             raise ValueError(f"{field}: got {value}, expected {only} in simulation")
+    if config.env.physics not in PHYSICS:
+        raise ValueError(f"env.physics: got {config.env.physics!r}, expected one of {', '.join(PHYSICS)}")
     network = config.network
     if isinstance(network, ConvConfig) and len(network.filters) != len(network.strides):
         expected = f"as many as network.filters = {network.filters}"

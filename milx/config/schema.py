@@ -37,8 +37,9 @@ class EnvConfig:
         goal_step: the time step of a demonstration at which the robot is at the goal that a goal head learns to see
             (`milx.data.goals`). None for the environment's own rule: in push where the hand comes down, and elsewhere
             where the demonstration ends.
-        physics: who steps the world, one of PHYSICS. MuJoCo Warp is made for NVIDIA's GPUs and has no derivatives;
-            iLQR plans with MJX all the same. Worlds that integrate by themselves, reach and place, have "jax" alone.
+        physics: who steps the world, one of PHYSICS. Warp is made for NVIDIA's GPUs, and has been tried with one in a
+            process. It has no derivatives, so that iLQR plans by MJX in JAX all the same. Reach and place can be
+            stepped by MJX in JAX only.
     """
 
     image_shape: tuple[int, int] = number((64, 80), 1, 4096)

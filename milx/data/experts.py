@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import hashlib
+import importlib.metadata
 import json
 from typing import Any
 
@@ -29,8 +30,8 @@ def expert_of(env: Env, config: DataConfig) -> Options | Sampling | receding.Set
     """Returns the expert that a run's settings ask for.
 
     The first expert that plans whole episodes of an environment by sampling searches for plans with which others begin,
-    under the same noise, and keeps them in the user's cache. Scenes in which that fails begin again with the plans of
-    others.
+    under the same noise, lets these scenes begin again with each other's plans, in rounds, and keeps the plans in the
+    user's cache.
 
     It says so if fewer than half of these plans succeed.
 
@@ -74,9 +75,10 @@ def _check(config: DataConfig) -> None:
 
 def digest(env: Env, *request: Any) -> str:
     """Hashes what was asked of an expert, and all versions that what it plans depends on."""
-    described = [env.name, *request, env.action_cost, *([] if env.physics == "jax" else [env.physics])]
     versions = [jax.default_backend(), jax.__version__, mujoco.__version__, env.version, expert.VERSION]
-    return hashlib.sha256(json.dumps([*described, *versions]).encode()).hexdigest()[:16]
+    if env.physics == "warp":
+        versions.append(f"warp {importlib.metadata.version('warp-lang')}")
+    return hashlib.sha256(json.dumps([env.name, *request, env.action_cost, *versions]).encode()).hexdigest()[:16]
 
 
 @functools.cache

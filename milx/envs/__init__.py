@@ -4,7 +4,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from milx.config.registry import ENVS, register_env_at
-from milx.config.schema import PHYSICS, Config
+from milx.config.schema import Config
 from milx.envs.grasp.presets import GRASP
 from milx.envs.place.presets import PLACE, PLACE_DURATIONS
 from milx.envs.push.presets import PUSH, PUSH_DURATIONS
@@ -38,16 +38,12 @@ def of_config(config: Config) -> "Env":
     """Builds the environment of a configuration.
 
     Raises:
-        ValueError: as `find` and `World.by_warp`; for physics that do not exist.
+        ValueError: as `find` and `World.by_warp`.
     """
-    if (physics := config.env.physics) not in PHYSICS:
-        raise ValueError(f"env.physics: got {physics!r}, expected one of {', '.join(PHYSICS)}")
     env = make(config.env_name, config.env.image_shape, config.env.action_cost)
-    if physics == "warp":
-        env = env.by_warp()
     if config.env.goal_step is not None:
         env.goal_step = config.env.goal_step
-    return env
+    return env.by_warp() if config.env.physics == "warp" else env
 
 
 def make(name: str, image_shape: tuple[int, int] | None = None, action_cost: float | None = None) -> "Env":

@@ -32,18 +32,22 @@ class WarpPhysics:
         constraints: the largest number of rows of its constraints.
 
     Raises:
-        ValueError: if `warp-lang` is not installed.
+        ValueError: if `warp-lang` is not installed, or the device is neither a GPU nor a CPU.
     """
 
     def __init__(self, model: mujoco.MjModel, contacts: int, constraints: int):
         try:
             import warp
-            from mujoco.mjx.third_party.mujoco_warp import OverflowType
         except ImportError as error:
-            raise ValueError("physics: got 'warp', expected `pip install 'milx[warp]'` first") from error
-        warp.config.log_level = warp.LOG_WARNING  # and not of every kernel that it loads
-        self._mj_model, self._contacts, self._constraints = model, contacts, constraints
+            raise ValueError("env.physics: got 'warp', expected `pip install 'milx[warp]'` first") from error
+        from mujoco.mjx.third_party.mujoco_warp import OverflowType
+
+        if warp.config.log_level == warp.LOG_INFO:  # the default, which names every kernel that is loaded
+            warp.config.log_level = warp.LOG_WARNING
         device = jax.local_devices()[0]
+        if device.platform not in ("cpu", "gpu"):
+            raise ValueError(f"env.physics: got 'warp' on a {device.platform}, expected an NVIDIA GPU or a CPU")
+        self._mj_model, self._contacts, self._constraints = model, contacts, constraints
         self._model = mjx.put_model(model, device, impl="warp")
         # Models limit the solver's iterations on purpose, so reaching them is not worth a message; all pairs of geoms
         # are examined, since by bounding volumes of the shapes that the model was compiled with some would be missed.
@@ -64,23 +68,30 @@ class WarpPhysics:
             substeps: how many.
 
         Returns:
-            The next x [nq + nv].
+            The next x [nq + nv], computed in float32.
         """
         leaves, structure = jax.tree.flatten(self._of(model))
-        alone = x[None], mocap_pos[None], ctrl[None]
-        batched = (False,) * len(leaves) + (True,) * len(alone)
-        return self._worlds(structure, batched, substeps)(*leaves, *alone)[0]
+        alone = (jnp.float32(each)[None] for each in (x, mocap_pos, ctrl))
+        batched = (False,) * len(leaves) + (True,) * 3
+        return self._worlds(structure, batched, substeps)(*leaves, *alone)[0].astype(x.dtype)
 
     def _of(self, model: mjx.Model) -> mjx.Model:
-        """Returns Warp's model with what MJX's model in JAX says of shapes, masses and options."""
+        """Returns Warp's model with the shapes, masses, friction, time step and iterations of MJX's in JAX."""
         own = self._model
 
-        def alike(name: str) -> bool:
-            mine, other = getattr(own, name), getattr(model, name)
-            return isinstance(mine, jax.Array) and (mine.shape, mine.dtype) == (other.shape, other.dtype)
+        def taken(name: str) -> bool:
+            """Tells whether both mean the same by an array of real numbers; bounding boxes have other shapes."""
+            mine = getattr(own, name)
+            return (
+                isinstance(mine, jax.Array)
+                and jnp.issubdtype(mine.dtype, jnp.floating)
+                and mine.shape == getattr(model, name).shape
+            )
 
-        names = [field.name for field in dataclasses.fields(own) if alike(field.name)]
-        return own.replace(opt=model.opt.replace(_impl=self._options), **{name: getattr(model, name) for name in names})
+        names = [field.name for field in dataclasses.fields(own) if taken(field.name)]
+        options = model.opt.replace(_impl=self._options)
+        changed = {name: getattr(model, name) for name in names} | {"opt": options}
+        return own.replace(**jax.tree.map(_in_float32, changed))
 
     def _make_worlds(self, structure: Any, batched: tuple[bool, ...], substeps: int) -> Callable[..., jax.Array]:
         """Makes the function of the leaves of a model, and of x [N, nq + nv], mocap_pos and ctrl, to the next x.
@@ -131,6 +142,10 @@ class WarpPhysics:
         def widened(x: jax.Array, wanted: jax.ShapeDtypeStruct) -> jax.Array:
             return x if x.shape == wanted.shape else jnp.full(wanted.shape, x.ravel()[0], wanted.dtype)
 
-        # Arrays for all contacts would be constants in the program; these are filled when it runs.
+        # Arrays for all contacts would be constants in the program; these, of the same number everywhere, are not.
         few, many = room_for(1), jax.eval_shape(lambda: room_for(worlds))
         return jax.tree.unflatten(jax.tree.structure(many), map(widened, jax.tree.leaves(few), jax.tree.leaves(many)))
+
+
+def _in_float32(x: jax.Array) -> jax.Array:
+    return x.astype(jnp.float32) if jnp.issubdtype(x.dtype, jnp.floating) else x

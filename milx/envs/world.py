@@ -82,17 +82,18 @@ class World(abc.ABC, Generic[TaskT]):
         platform.warn_if_not_configured()
         self.mj_model = model
         device = jax.local_devices()[0]  # MJX would take the first of all, which may be another host's
-        self.model = mjx.put_model(model, device)
+        self.model = mjx.put_model(model, device, impl="jax")
         if image_shape is not None:
             self.image_shape = image_shape
         self.renderer = Renderer(model, self.camera, *self.image_shape)
         self._data = mjx.make_data(self.model, device)
         self._warp: WarpPhysics | None = None
+        self._by_jax: Any = None
 
     @property
     def differentiable(self) -> Self:
-        """The same world with steps that can be differentiated, by MJX in JAX."""
-        return self._stepped_by(None) if self._warp else self
+        """The world whose steps can be differentiated: this one, or that of which `by_warp` made it."""
+        return self if self._by_jax is None else self._by_jax
 
     @property
     def physics(self) -> str:
@@ -100,20 +101,20 @@ class World(abc.ABC, Generic[TaskT]):
         return "warp" if self._warp else "jax"
 
     def by_warp(self) -> Self:
-        """Returns the same world, stepped by MuJoCo Warp.
+        """Returns a copy that is stepped by MuJoCo Warp.
 
         Raises:
-            ValueError: for a world that integrates in its own way; as `WarpPhysics`.
+            ValueError: for a world that overrides `integrate`; where `warp-lang` is not installed; on a device that is
+                neither an NVIDIA GPU nor a CPU.
         """
         if type(self).integrate is not World.integrate:
             raise ValueError(
-                f"physics: got 'warp', expected 'jax' for {type(self).__name__}, which overrides integrate"
+                f"env.physics: got 'warp', expected 'jax' for {type(self).__name__}, whose steps are its own"
             )
-        return self._stepped_by(WarpPhysics(self.mj_model, self._data._impl.ncon, self._data._impl.nefc))
-
-    def _stepped_by(self, warp: WarpPhysics | None) -> Self:
         world = copy.copy(self)
-        world._warp = warp
+        # Of some pairs of geoms Warp finds up to twice as many contacts, for example of two boxes.
+        contacts, constraints = 2 * self._data._impl.ncon, 2 * self._data._impl.nefc
+        world._warp, world._by_jax = WarpPhysics(self.mj_model, contacts, constraints), self
         return world
 
     @property

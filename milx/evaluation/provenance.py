@@ -10,7 +10,7 @@ from typing import Any
 
 import jax
 
-_PACKAGES = ("milx", "jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "orbax-checkpoint", "numpy")
+_PACKAGES = ("milx", "jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "orbax-checkpoint", "numpy", "warp-lang")
 
 
 def origin() -> dict[str, Any]:

@@ -24,8 +24,8 @@ from milx.trajopt.ilqr import Options, Plan, solve
 from milx.trajopt.planner import Plans, Settings
 
 VERSION = 2
-"""Of all that plans and demonstrates: raised when it does so differently, so that no demonstration planned before it is
-taken for one planned after it."""
+"""Of all that plans and demonstrates: raised when it does so differently with the same settings, so that no
+demonstration planned before it is taken for one planned after it."""
 
 
 def plan(env: Env, task: Task, state: State, options: Options) -> Plan:

@@ -240,8 +240,8 @@ def share_plans(env: Env, settings: Settings, plans: Plans, noise: jax.Array | f
     """Lets the scenes of `find_plans` begin again with each other's plans, in rounds.
 
     In each round every scene plans, beginning with the cheapest of the plans of the nearest scenes in which one
-    succeeded, its own among them, and keeps what it finds if that succeeds. Without any plan that succeeded nothing can
-    begin, and the plans are returned as they are.
+    succeeded, and takes what it finds for its plan if that succeeds. Without any plan that succeeded nothing can begin,
+    and the plans are returned as they are.
 
     Args:
         env: the environment.

@@ -10,8 +10,8 @@ import numpy as np
 
 from milx.envs.grasp import env as grasp
 
-CLOSING, LIFTED = 24, 39
-"""The time steps at which the fingers begin to close, and at which the thing has been lifted."""
+CLOSING, LIFTED = 16 + 8, 16 + 8 + 5 + 10
+"""The time steps at which the fingers of `wanted` begin to close, and at which the thing has been lifted."""
 
 
 def first(tree, number=0):
@@ -33,9 +33,8 @@ def wanted(task, state):
     """Lists where the hand goes, and how it closes, in each step of a blind grasp: down, up, over the mat, down."""
     thing, mat = state.qpos[5:8], state.mocap_pos[task.target]
     low, way = thing.at[2].set(0.006), mat.at[2].set(0.1)
-    phases = [(thing.at[2].set(0.06), 16, -1), (low, CLOSING - 16, -1), (low, 5, 1)]
-    phases += [(thing.at[2].set(0.1), LIFTED - CLOSING - 5, 1)]
-    phases += [(way, 25, 1), (mat.at[2].set(0.05), 8, 1), (mat.at[2].set(0.05), 47 - LIFTED, -1)]
+    phases = [(thing.at[2].set(0.06), 16, -1), (low, 8, -1), (low, 5, 1), (thing.at[2].set(0.1), 10, 1)]
+    phases += [(way, 25, 1), (mat.at[2].set(0.05), 8, 1), (mat.at[2].set(0.05), 8, -1)]
     return jnp.stack([jnp.append(place, grip) for place, steps, grip in phases for _ in range(steps)])
 
 

@@ -257,7 +257,10 @@ def turned(state):
 
 
 def test_the_mirror_image_of_an_episode_is_an_episode(env, tasks, starts):
-    """Acts in a world and in its mirror image, with the mirrored thing and actions, in C MuJoCo."""
+    """Acts in a world and in its mirror image, with the mirrored thing and actions, in C MuJoCo.
+
+    They differ a little after a push, since the motor is on the left finger and the right one follows it.
+    """
     task, start, rng = first(tasks), first(starts), np.random.default_rng(0)
     models = c_model(env, task), c_model(env, task)
     drawn = np.isin(env.mj_model.geom_bodyid, env._body)  # the hand is its own mirror image, with exchanged fingers
@@ -278,7 +281,6 @@ def test_the_mirror_image_of_an_episode_is_an_episode(env, tasks, starts):
             mujoco.mj_step(model, data, env.substeps)
         moved = np.abs(worlds[0].qpos[5:8] - begin[0][5:8]).max()
         assert worlds[0].time < env.horizon * env.substeps * env.mj_model.opt.timestep
-    # The left finger has the motor, and the right one follows it by a constraint that gives way a little.
     qpos, qvel = turned((worlds[0].qpos, worlds[0].qvel))
     np.testing.assert_allclose(worlds[1].qpos, qpos, atol=3e-3)
     np.testing.assert_allclose(worlds[1].qvel[:8], qvel[:8], atol=6e-3)

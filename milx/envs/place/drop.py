@@ -58,7 +58,7 @@ class Drop:
     def __init__(self) -> None:
         self.mj_model = _build()
         device = jax.local_devices()[0]
-        self._model = mjx.put_model(self.mj_model, device)
+        self._model = mjx.put_model(self.mj_model, device, impl="jax")
         self._data = mjx.make_data(self._model, device)
         self._capsules = np.array([self.mj_model.geom(f"capsule_{i}").id for i in range(NUM_CAPSULES)])
         self._walls = np.array([self.mj_model.geom(f"wall_{i}").id for i in range(containers.WALLS)])

@@ -72,7 +72,7 @@ class Reach(Env[ReachTask]):
         self._rgba = jnp.asarray(self.mj_model.geom_rgba, float)
         self._height = float(self.mj_model.body("target").pos[2])
         arm = _arm()
-        self._arm = mjx.put_model(arm, jax.local_devices()[0])
+        self._arm = mjx.put_model(arm, jax.local_devices()[0], impl="jax")
         self._arm_data = mjx.make_data(self._arm, jax.local_devices()[0])
         self._links = jnp.stack([arm.body("forearm").pos[:2], arm.site("fingertip").pos[:2]])
 
