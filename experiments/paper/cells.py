@@ -128,13 +128,18 @@ class Cells:
         """Tells whether the cell has its file.
 
         Raises:
-            ValueError: if the file is another configuration's; the message shows the difference.
+            ValueError: if the file is another configuration's (the message shows the difference), or of another version
+                of the environment; old files do not tell theirs.
         """
         path = self.folder / f"{name}.json"
         if not path.is_file():
             return False
-        theirs = assemble.from_dict(json.loads(path.read_text())["config"])
-        if changed := assemble.differences(_contents(theirs), _contents(config)):
+        found, version = json.loads(path.read_text()), envs.find(config.env_name).version
+        if (theirs := found.get("env_version", version)) != version:
+            held = f"holds a cell of version {theirs} of {config.env_name}"
+            raise ValueError(f"{path}: {held}, expected {version}; remove the file to train the cell again")
+        before = assemble.from_dict(found["config"])
+        if changed := assemble.differences(_contents(before), _contents(config)):
             raise ValueError(f"{path}: holds another cell: {'; '.join(changed)}")
         return True
 

@@ -317,6 +317,7 @@ def summarize(
 
     other = {name: judged(success, baselines.other[name], misled.other[name]) for name, success in trials.other.items()}
     return {
+        "env_version": env.version,
         "num_tasks_train": config.data.tasks,
         "num_demos_train": config.data.tasks * config.data.demos_per_task,
         "shots": config.evaluation.shots,

@@ -47,11 +47,11 @@ def test_wilson_interval_against_scipy(trials):
 def test_a_result_counts_trials_by_every_criterion_and_has_baselines_beside_each():
     table = jnp.array([[True, False, True], [False, False, True]])
     baselines = closed_loop.Baselines({"random": 0.1}, {"nearly": {"random": 0.2}})
-    env = types.SimpleNamespace(vision=True, criterion="exactly", target_kind=lambda task: task)
+    env = types.SimpleNamespace(vision=True, criterion="exactly", version=3, target_kind=lambda task: task)
     trials = closed_loop.Trials(table, {"nearly": ~table | table}, ())
     misled = closed_loop.Trials(~table, {"nearly": table}, ())
     found = closed_loop.summarize(env, tiny_config(), jnp.array([-1, -1]), trials, misled, baselines)
-    assert (found["trials"], found["success"]) == (6, 0.5)
+    assert (found["trials"], found["success"], found["env_version"]) == (6, 0.5, 3)
     assert found["baselines"] == {"random": 0.1, "other_demo": 0.5}
     assert found["wilson95"] == list(intervals.wilson_interval(3, 6))
     np.testing.assert_allclose(found["bootstrap95"], [1 / 3, 2 / 3], rtol=1e-6)

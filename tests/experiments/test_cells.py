@@ -50,6 +50,9 @@ def test_a_cell_is_a_run(trained, tmp_path, monkeypatch):
     config.optimizer.learning_rate = 0.5
     with pytest.raises(ValueError, match=r"cell.json: holds another cell: optimizer.learning_rate was 0.002, now 0.5"):
         runner.run({"cell": config})
+    monkeypatch.setattr(cells.envs.find(config.env_name), "version", trained.run.env.version + 1)
+    with pytest.raises(ValueError, match=r"cell.json: holds a cell of version \d+ of \w+, expected \d+; remove"):
+        runner.run({"cell": config})
 
 
 def test_a_checkpoint_belongs_to_configuration_commit_and_versions_but_to_no_machine(tmp_path, monkeypatch):

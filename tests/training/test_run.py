@@ -23,7 +23,7 @@ from milx.training.state import initial_state
 
 RESULT_FIELDS = {
     *("env", "method", "preset", "variant", "seed", "num_tasks_train", "num_demos_train", "shots", "given"),
-    *("trials", "success", "wilson95", "criterion", "baselines", "wall_clock_s", "steps", "config"),
+    *("env_version", "trials", "success", "wilson95", "criterion", "baselines", "wall_clock_s", "steps", "config"),
     *("dataset_hash", "commit", "hardware", "versions"),
 }
 
