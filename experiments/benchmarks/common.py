@@ -73,7 +73,7 @@ class Report:
         self.folder.mkdir(parents=True, exist_ok=True)
         today = datetime.datetime.now(datetime.UTC).date().isoformat()
         content = {"benchmark": self.benchmark, "date": today, **provenance.origin(), "rows": self.rows}
-        content["versions"] |= provenance.versions(("torch", "warp-lang", "hydrax", "jaxopt", "higher", "torchopt"))
+        content["versions"] |= provenance.versions(("torch", "hydrax", "jaxopt", "higher", "torchopt"))
         file = self.benchmark if accelerated() else f"{self.benchmark}-cpu"
         (self.folder / f"{file}.json").write_text(json.dumps(content, indent=1) + "\n")
 
