@@ -94,7 +94,7 @@ class Push(Env[PushTask]):
     height_index = 16
     tactics = (0.0, 0.02, -0.02)
     action_cost = 0.1
-    version = 3
+    version = 4
 
     def __init__(self, image_shape: tuple[int, int] | None = None):
         super().__init__(_build(), image_shape)

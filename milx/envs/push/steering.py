@@ -12,9 +12,10 @@ from milx.envs.steering import Steering
 if TYPE_CHECKING:
     from milx.envs.push.env import Push
 
-LIMITS = (0.8, 0.8, 0.6, 3.0)
-"""Of the hand's velocity along x, y and z (m/s), and of its turning about z (rad/s)."""
-DEVIATION = (0.3, 0.3, 0.3, 1.0)
+LIMITS = (0.3, 0.3, 0.225, 1.125)
+"""Of the hand's velocity along x, y and z (m/s), and of its turning about z (rad/s). Policies imitate a slow hand more
+easily than a fast one."""
+DEVIATION = (0.135, 0.135, 0.135, 0.45)
 """Standard deviation of what the planner tries first, in the same units."""
 UPRIGHT = 6.0
 """Rate at which the hand returns to pointing down (1/s)."""
