@@ -284,7 +284,7 @@ class Cells:
                 lambda: closed_loop.precompile_listen(env, trainer.method, params, validation),
             )
             data = demos_lib.shapes(env, self.capacity, config.data.demos_per_task)
-            return compile_in_background(trainer, params, data, config.train.log_every, then)
+            return compile_in_background(trainer, params, data, config.train.log_every, then, env.steps_alone)
 
         return self._once(("compiled", self._programs(config)), start)
 

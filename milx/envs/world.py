@@ -100,6 +100,15 @@ class World(abc.ABC, Generic[TaskT]):
         """Whose implementation of MJX steps the world, one of `milx.config.schema.PHYSICS`."""
         return "warp" if self._warp else "jax"
 
+    @property
+    def steps_alone(self) -> bool:
+        """Whether nothing may compile in the process while the world is stepped.
+
+        On a GPU, Warp records its kernels as CUDA graphs from JAX's stream, on which XLA tries kernels out when it
+        compiles in another thread: then recording fails.
+        """
+        return self.physics == "warp" and jax.default_backend() == "gpu"
+
     def by_warp(self) -> Self:
         """Returns a copy that is stepped by MuJoCo Warp.
 

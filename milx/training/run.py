@@ -117,6 +117,11 @@ class Run(abc.ABC):
     def report(self, result: dict[str, Any]) -> None:
         """Prints a result of `evaluate`."""
 
+    @property
+    def _compiles_first(self) -> bool:
+        """Whether all is compiled before training loads its data, instead of at the same time."""
+        return False
+
     def _precompile(self, params: Params) -> list[Callable[[], None]]:
         """Lists other programs worth compiling in the background, from the shapes of the parameters."""
         del params
@@ -150,7 +155,8 @@ class Run(abc.ABC):
                 fixed_filters.read_filters(network.fixed_filters, network)  # refuses a bad file before planning
             params = self._params_like
             others = self._precompile(params)
-            compiled = compile_in_background(self.trainer, params, self._shapes(), config.log_every, others)
+            shapes, first = self._shapes(), self._compiles_first
+            compiled = compile_in_background(self.trainer, params, shapes, config.log_every, others, first)
             training = self._load()
             state, key = self._start(training, checkpoints)
             with self.clock("compile"), self.phase("compiling the training program"):

@@ -223,6 +223,10 @@ class SimulatedRun(Run):
     def _shapes(self) -> DemoSet:
         return demos_lib.shapes(self.env, self.config.data.tasks, self.config.data.demos_per_task)
 
+    @property
+    def _compiles_first(self) -> bool:
+        return self.env.steps_alone
+
     def _precompile(self, params: Params) -> list[Callable[[], None]]:
         env, config, random = self.env, self.config.evaluation, Random(self.env.action_size)
         fewer = min(config.baseline_trials, config.trials)

@@ -204,7 +204,7 @@ class Trainer:
 
 
 def compile_in_background(
-    trainer: Trainer, params: Params, data: Any, steps: int, then: Iterable[Callable[[], None]]
+    trainer: Trainer, params: Params, data: Any, steps: int, then: Iterable[Callable[[], None]], wait: bool = False
 ) -> Future[Callable[..., Any]]:
     """Compiles `Trainer.run` from shapes alone while the caller does something else, then calls each of `then`.
 
@@ -216,6 +216,7 @@ def compile_in_background(
         data: shapes of what `run` draws its batches from.
         steps: meta-updates of a scan.
         then: functions that compile other programs.
+        wait: whether to return only after all of them, for programs beside which nothing may compile.
 
     Returns:
         The future program, a function of a state, data and a key.
@@ -231,5 +232,5 @@ def compile_in_background(
     compiled = thread.submit(compile_run)
     for compile_more in then:
         thread.submit(compile_more)
-    thread.shutdown(wait=False)
+    thread.shutdown(wait=wait)
     return compiled

@@ -1,7 +1,9 @@
-"""The meta-optimizer: what it does to a constant gradient is minus the learning rate."""
+"""The meta-optimizer: what it does to a constant gradient is minus the learning rate. And when programs compile."""
 
 import dataclasses
 import re
+import threading
+import types
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +13,7 @@ import pytest
 from milx.config.assemble import make_config
 from milx.config.registry import PRESETS
 from milx.config.schema import OptimizerConfig
-from milx.training.update import make_optimizer
+from milx.training.update import Trainer, compile_in_background, make_optimizer
 
 STEPS = 40
 
@@ -73,3 +75,23 @@ def test_muon_moves_a_kernel_by_an_orthogonal_matrix_near_its_gradient(shape):
 def test_an_optimizer_that_does_not_exist():
     with pytest.raises(ValueError, match=re.escape("optimizer.name: got 'sgd', expected one of adam, muon")):
         make_optimizer(OptimizerConfig(name="sgd"), STEPS)
+
+
+@pytest.mark.parametrize("wait", [True, False])
+def test_compiling_waits_for_all_programs_where_asked_to(wait, monkeypatch):
+    lowered = types.SimpleNamespace(compile=lambda options: "the program")
+    monkeypatch.setattr(Trainer, "run", types.SimpleNamespace(lower=lambda *_: lowered))
+    trainer = types.SimpleNamespace(optimizer=optax.sgd(1.0))
+    returned, others = threading.Event(), []
+
+    def compile_other():
+        """Compiles for half a second, or until `compile_in_background` has returned, and tells whether it has."""
+        others.append(returned.wait(0.5))
+
+    compiled = compile_in_background(trainer, {}, {}, 1, [compile_other, compile_other], wait)
+    returned.set()
+    assert compiled.result() == "the program"
+    if wait:
+        assert others == [False, False]
+    else:
+        assert others in ([], [True], [True, True])
