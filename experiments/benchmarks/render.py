@@ -2,7 +2,9 @@
 
     python experiments/benchmarks/render.py
 
-From poses (after forward kinematics) to RGB, without shadows. MJX-Warp needs the package warp-lang and a GPU.
+From poses (after forward kinematics) to RGB, first with shadows, which favors MJX-Warp since milx's kernel knows none,
+then without. MJX-Warp needs the package warp-lang and a GPU. It has to build its bounding volumes anew for new poses,
+and is timed without that first, which favors it, too.
 """
 
 import os
@@ -10,6 +12,7 @@ import os
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # Warp needs memory in the same process
 
 import functools
+import itertools
 import multiprocessing
 import pathlib
 from collections.abc import Callable
@@ -42,15 +45,22 @@ def random_scenes(env: Env, count: int) -> Scene:
 
 
 def measure_warp(
-    model: mujoco.MjModel, image_shape: tuple[int, int], qpos: jax.Array, mocap_pos: jax.Array
+    model: mujoco.MjModel,
+    image_shape: tuple[int, int],
+    qpos: jax.Array,
+    mocap_pos: jax.Array,
+    shadows: bool = False,
+    refit: bool = True,
 ) -> tuple[float, None]:
-    """Measures frames/s of MJX-Warp's batch renderer, which builds its bounding volumes anew for new poses.
+    """Measures frames/s of MJX-Warp's batch renderer.
 
     Args:
         model: whose cameras are all drawn.
         image_shape: (H, W).
         qpos: [N, nq] of N scenes.
         mocap_pos: [N, nmocap, 3] of the same.
+        shadows: whether lights throw them.
+        refit: whether bounding volumes are built anew for every batch of poses, or kept from the first.
     """
     import warp  # noqa: F401  without it MJX fails later and says less
 
@@ -68,16 +78,17 @@ def measure_warp(
         nworld=count,
         cam_res=(width, height),
         use_textures=False,
-        use_shadows=False,
+        use_shadows=shadows,
         render_rgb=True,
         render_depth=False,
         enabled_geom_groups=[0, 1, 2],
     )
 
     def render(mx: mjx.Model, data: mjx.Data) -> jax.Array:
-        data = mjx.refit_bvh(mx, data, context.pytree())
+        data = mjx.refit_bvh(mx, data, context.pytree()) if refit else data
         return mjx.render(mx, data, context.pytree())[0]
 
+    data = jax.jit(lambda mx, data: mjx.refit_bvh(mx, data, context.pytree()))(mx, data)
     compiled = jax.jit(render, compiler_options={"xla_gpu_graph_min_graph_size": 1})
     image = compiled(mx, data)
     if not jnp.any(image != image.ravel()[0]):
@@ -85,20 +96,20 @@ def measure_warp(
     return 1e3 * count / common.median_ms(compiled, mx, data), None
 
 
-def measure_warp_in(env: Env, count: int) -> tuple[float, None]:
+def measure_warp_in(env: Env, count: int, shadows: bool, refit: bool) -> tuple[float, None]:
     """Measures MJX-Warp's frames/s in random first states of an environment."""
     task = env.sample_task(jax.random.key(0), "train")
     states = jax.jit(jax.vmap(lambda key: env.reset(key, task)))(jax.random.split(jax.random.key(1), count))
-    return measure_warp(env.mj_model, env.image_shape, states.qpos, states.mocap_pos)
+    return measure_warp(env.mj_model, env.image_shape, states.qpos, states.mocap_pos, shadows, refit)
 
 
-def measure_opengl(model: mujoco.MjModel, camera: str, image_shape: tuple[int, int]) -> float:
+def measure_opengl(model: mujoco.MjModel, camera: str, image_shape: tuple[int, int], shadows: bool) -> float:
     """Measures frames/s of `mujoco.Renderer`."""
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     model.vis.quality.offsamples = 0  # one sample in a pixel, as milx
     with mujoco.Renderer(model, *image_shape) as renderer:
-        renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
+        renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
 
         def render() -> object:
             renderer.update_scene(data, camera=camera)
@@ -107,11 +118,11 @@ def measure_opengl(model: mujoco.MjModel, camera: str, image_shape: tuple[int, i
         return 1e3 / common.median_ms(render)
 
 
-def measure_opengl_elsewhere(env: Env) -> tuple[float, None]:
+def measure_opengl_elsewhere(env: Env, shadows: bool) -> tuple[float, None]:
     """Measures the same in another process: without a display, OpenGL may abort."""
     os.environ.setdefault("MUJOCO_GL", "egl")  # for the other process only: where EGL is missing, MuJoCo does not load
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
-        return pool.submit(measure_opengl, env.mj_model, env.camera, env.image_shape).result(), None
+        return pool.submit(measure_opengl, env.mj_model, env.camera, env.image_shape, shadows).result(), None
 
 
 def draw_by_xla(renderer: Renderer, scene: Scene) -> jax.Array:
@@ -125,24 +136,30 @@ def measure_milx(scenes: Scene, draw: Callable[[Scene], jax.Array]) -> tuple[flo
     return 1e3 * len(scenes.cam_xpos) / common.median_ms(compiled, scenes), common.gib(compiled)
 
 
+def compare(report: common.Report, env: Env, count: int, shadows: bool) -> None:
+    """Adds all rows of an environment with or without shadows, `count` images at once."""
+    (height, width), note = env.image_shape, f"{count} at once"
+    name = f"{env.name}, {env.mj_model.ngeom} geoms, {width}x{height}{', shadows' if shadows else ''}"
+    unit, scenes = "frames/s", random_scenes(env, count)
+    renderer = Renderer(env.mj_model, env.camera, height, width, shadows=shadows)
+    report.measure(f"{name}: milx", unit, functools.partial(measure_milx, scenes, renderer.pixels), note)
+    if common.accelerated() and not shadows:
+        draw = functools.partial(draw_by_xla, renderer)
+        report.measure(f"{name}: milx, XLA", unit, functools.partial(measure_milx, scenes, draw), note)
+    warp = functools.partial(measure_warp_in, env, count, shadows)
+    report.attempt(f"{name}: MJX-Warp, volumes kept", unit, functools.partial(warp, refit=False), note)
+    report.attempt(f"{name}: MJX-Warp", unit, functools.partial(warp, refit=True), note)
+    opengl = functools.partial(measure_opengl_elsewhere, env, shadows)
+    report.attempt(f"{name}: mujoco.Renderer", unit, opengl, "one by one")
+
+
 def main(_: list[str]) -> None:
     """Measures and writes the JSON file."""
     milx.configure()
     report = common.Report("render", pathlib.Path(_OUT.value))
     count = _FRAMES.value or (64 if not common.accelerated() else 4096)
-    note = f"{count} at once"
-    for env in (push_sized.PushSized(), envs.make("reach")):
-        height, width = env.image_shape
-        name = f"{env.name}, {env.mj_model.ngeom} geoms, {width}x{height}"
-        scenes, draw = random_scenes(env, count), env.renderer.pixels
-        report.measure(f"{name}: milx", "frames/s", functools.partial(measure_milx, scenes, draw), note)
-        if common.accelerated():
-            draw = functools.partial(draw_by_xla, env.renderer)
-            report.measure(f"{name}: milx, XLA", "frames/s", functools.partial(measure_milx, scenes, draw), note)
-        report.attempt(f"{name}: MJX-Warp", "frames/s", functools.partial(measure_warp_in, env, count), note)
-        report.attempt(
-            f"{name}: mujoco.Renderer", "frames/s", functools.partial(measure_opengl_elsewhere, env), "one by one"
-        )
+    for env, shadows in itertools.product((push_sized.PushSized(), envs.make("reach")), (True, False)):
+        compare(report, env, count, shadows)
 
 
 if __name__ == "__main__":
