@@ -4,6 +4,7 @@ Cells that differ only in seed and number of training tasks share every program:
 one larger set, repeated to its size, so that shapes stay the same.
 """
 
+import concurrent.futures
 import contextlib
 import dataclasses
 import hashlib
@@ -159,8 +160,11 @@ class Cells:
         self.forget()
 
     def _run(self, name: str, config: Config) -> dict[str, Any]:
+        began = time.perf_counter()
+        programs = self._compiling(config)  # while demonstrations are planned
+        if self._env(config).captures_graphs:
+            concurrent.futures.wait(programs)
         clock = [time.perf_counter()]
-        self._compiling(config)  # while demonstrations are planned
         env, method, evaluation = self._env(config), self._trainer(config).method, config.evaluation
         train, test = self._first_tasks(config), self._demos(config, "test")
         baselines = self._once(
@@ -174,6 +178,7 @@ class Cells:
         clock.append(time.perf_counter())
         demos_s, _, evaluate_s = (later - earlier for earlier, later in itertools.pairwise(clock))
         seconds = {"demos": demos_s, **trained.seconds, "evaluate": trained.seconds["evaluate"] + evaluate_s}
+        seconds["compile"] += clock[0] - began
         seconds["total"] = sum(seconds.values())
         digest = pytrees.fingerprint(train)
         result = results.compose(config, found, seconds, trained.step, digest)
@@ -235,7 +240,7 @@ class Cells:
             print(f"  {name}: goes on from step {int(state.step)}", flush=True)
 
         with clock("compile"):
-            scan = self._compiling(config).result()
+            scan = self._compiling(config)[0].result()
 
         def validate(state: TrainState) -> float:
             step = int(state.step)
@@ -272,10 +277,10 @@ class Cells:
         make = lambda: Trainer(sample, method, config.train, optimizer)  # noqa: E731
         return self._once(("trainer", self._programs(config)), make)
 
-    def _compiling(self, config: Config) -> Future[Callable[..., Any]]:
-        """Compiles what trains and validates a cell, in the background."""
+    def _compiling(self, config: Config) -> list[Future[Any]]:
+        """Compiles what trains and validates a cell, in the background, as `compile_in_background` returns it."""
 
-        def start() -> Future[Callable[..., Any]]:
+        def start() -> list[Future[Any]]:
             env, trainer = self._env(config), self._trainer(config)
             params = methods.params_like(trainer.method, env.spec)
             validation = dataclasses.replace(config.evaluation, shots=config.train.shots)
@@ -284,7 +289,7 @@ class Cells:
                 lambda: closed_loop.precompile_listen(env, trainer.method, params, validation),
             )
             data = demos_lib.shapes(env, self.capacity, config.data.demos_per_task)
-            return compile_in_background(trainer, params, data, config.train.log_every, then, env.steps_alone)
+            return compile_in_background(trainer, params, data, config.train.log_every, then)
 
         return self._once(("compiled", self._programs(config)), start)
 

@@ -101,11 +101,11 @@ class World(abc.ABC, Generic[TaskT]):
         return "warp" if self._warp else "jax"
 
     @property
-    def steps_alone(self) -> bool:
-        """Whether nothing may compile in the process while the world is stepped.
+    def captures_graphs(self) -> bool:
+        """Whether CUDA graphs are captured from JAX's stream while the world is stepped, as Warp does on a GPU.
 
-        On a GPU, Warp records its kernels as CUDA graphs from JAX's stream, on which XLA tries kernels out when it
-        compiles in another thread: then recording fails.
+        Nothing may compile in another thread meanwhile: XLA's autotuning probably uses the stream, too, and then the
+        capture fails.
         """
         return self.physics == "warp" and jax.default_backend() == "gpu"
 

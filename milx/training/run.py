@@ -11,6 +11,7 @@ wandb_id, wandb/        of Weights & Biases, if `train.wandb` asks for it
 """
 
 import abc
+import concurrent.futures
 import contextlib
 import functools
 import pathlib
@@ -118,8 +119,8 @@ class Run(abc.ABC):
         """Prints a result of `evaluate`."""
 
     @property
-    def _compiles_first(self) -> bool:
-        """Whether all is compiled before training loads its data, instead of at the same time."""
+    def _compiles_alone(self) -> bool:
+        """Whether nothing may run while programs are compiled in the background."""
         return False
 
     def _precompile(self, params: Params) -> list[Callable[[], None]]:
@@ -155,12 +156,14 @@ class Run(abc.ABC):
                 fixed_filters.read_filters(network.fixed_filters, network)  # refuses a bad file before planning
             params = self._params_like
             others = self._precompile(params)
-            shapes, first = self._shapes(), self._compiles_first
-            compiled = compile_in_background(self.trainer, params, shapes, config.log_every, others, first)
+            compiled = compile_in_background(self.trainer, params, self._shapes(), config.log_every, others)
+            if self._compiles_alone:
+                with self.clock("compile"), self.phase("compiling all programs"):
+                    concurrent.futures.wait(compiled)
             training = self._load()
             state, key = self._start(training, checkpoints)
             with self.clock("compile"), self.phase("compiling the training program"):
-                scan = compiled.result()
+                scan = compiled[0].result()
             is_tracked = config.wandb is not None and parallel.is_first_host()
             track = functools.partial(Tracker, self.folder, self.config) if is_tracked else None
             metrics = MetricsWriter(self.folder, int(state.step), self._warn, track)

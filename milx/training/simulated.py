@@ -224,8 +224,8 @@ class SimulatedRun(Run):
         return demos_lib.shapes(self.env, self.config.data.tasks, self.config.data.demos_per_task)
 
     @property
-    def _compiles_first(self) -> bool:
-        return self.env.steps_alone
+    def _compiles_alone(self) -> bool:
+        return self.env.captures_graphs
 
     def _precompile(self, params: Params) -> list[Callable[[], None]]:
         env, config, random = self.env, self.config.evaluation, Random(self.env.action_size)

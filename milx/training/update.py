@@ -204,8 +204,8 @@ class Trainer:
 
 
 def compile_in_background(
-    trainer: Trainer, params: Params, data: Any, steps: int, then: Iterable[Callable[[], None]], wait: bool = False
-) -> Future[Callable[..., Any]]:
+    trainer: Trainer, params: Params, data: Any, steps: int, then: Iterable[Callable[[], None]]
+) -> list[Future[Any]]:
     """Compiles `Trainer.run` from shapes alone while the caller does something else, then calls each of `then`.
 
     One after the other: tracing holds Python's lock, so that more threads would slow the caller's tracing down.
@@ -216,10 +216,9 @@ def compile_in_background(
         data: shapes of what `run` draws its batches from.
         steps: meta-updates of a scan.
         then: functions that compile other programs.
-        wait: whether to return only after all of them, for programs beside which nothing may compile.
 
     Returns:
-        The future program, a function of a state, data and a key.
+        The future program, a function of a state, data and a key, and the futures of `then`, which hold nothing.
     """
     optimizer = jax.eval_shape(trainer.optimizer.init, params)
     state = TrainState(jax.ShapeDtypeStruct((), np.int32), params, optimizer)
@@ -229,8 +228,6 @@ def compile_in_background(
         return lowered.compile(platform.pixel_options())
 
     thread = ThreadPoolExecutor(max_workers=1)
-    compiled = thread.submit(compile_run)
-    for compile_more in then:
-        thread.submit(compile_more)
-    thread.shutdown(wait=wait)
-    return compiled
+    futures = [thread.submit(function) for function in (compile_run, *then)]
+    thread.shutdown(wait=False)
+    return futures

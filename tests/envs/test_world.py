@@ -99,3 +99,11 @@ def test_planners_by_sampling_choose_the_actions(env, state):
         np.testing.assert_allclose(steering.action(state, controls), action)
     np.testing.assert_array_equal(steering.correction(state, env.reset(None, None)), jnp.zeros(2))
     np.testing.assert_allclose(steering.deviation, 0.3, rtol=1e-6)
+
+
+@pytest.mark.parametrize("warp", [False, True])
+@pytest.mark.parametrize("backend", ["cpu", "gpu"])
+def test_only_warp_on_a_gpu_captures_graphs(env, warp, backend, monkeypatch):
+    monkeypatch.setattr(env, "_warp", object() if warp else None)
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
+    assert env.captures_graphs is (warp and backend == "gpu")

@@ -4,6 +4,8 @@ import copy
 import dataclasses
 import json
 import re
+import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import numpy as np
@@ -202,3 +204,25 @@ def test_evaluation_is_a_result_file(trained):
     assert set(clock) == {"demos", "compile", "train", "evaluate", "total"}
     parts = sum(seconds for name, seconds in clock.items() if name != "total")
     assert 0.5 * clock["total"] < parts <= clock["total"] * 1.001
+
+
+@pytest.mark.parametrize("captures", [False, True])
+def test_all_is_compiled_before_graphs_are_captured(captures, tmp_path, monkeypatch):
+    loading, compiled = threading.Event(), []
+
+    def compile_in_background(*_):
+        """Compiles until the demonstrations are loaded, which must not begin before where graphs are captured."""
+        compiled.append(thread.submit(loading.wait, 0.2 if captures else 10.0))
+        return compiled
+
+    def load(self):
+        loading.set()
+        raise StoppedError
+
+    monkeypatch.setattr("milx.training.run.compile_in_background", compile_in_background)
+    monkeypatch.setattr(SimulatedRun, "_load", load)
+    run = SimulatedRun(tiny_config(), tmp_path, QUIET)
+    monkeypatch.setattr(type(run.env), "captures_graphs", captures)
+    with ThreadPoolExecutor(max_workers=1) as thread, pytest.raises(StoppedError):
+        run.train()
+    assert compiled[0].result() is not captures, "whether loading began while programs were compiled"

@@ -1,6 +1,7 @@
-"""The meta-optimizer: what it does to a constant gradient is minus the learning rate. And when programs compile."""
+"""The meta-optimizer: what it does to a constant gradient is minus the learning rate; and programs that compile."""
 
 import dataclasses
+import functools
 import re
 import threading
 import types
@@ -77,21 +78,20 @@ def test_an_optimizer_that_does_not_exist():
         make_optimizer(OptimizerConfig(name="sgd"), STEPS)
 
 
-@pytest.mark.parametrize("wait", [True, False])
-def test_compiling_waits_for_all_programs_where_asked_to(wait, monkeypatch):
+def test_programs_compile_in_the_background_one_after_the_other(monkeypatch):
     lowered = types.SimpleNamespace(compile=lambda options: "the program")
     monkeypatch.setattr(Trainer, "run", types.SimpleNamespace(lower=lambda *_: lowered))
     trainer = types.SimpleNamespace(optimizer=optax.sgd(1.0))
-    returned, others = threading.Event(), []
+    returned, order = threading.Event(), []
 
-    def compile_other():
-        """Compiles for half a second, or until `compile_in_background` has returned, and tells whether it has."""
-        others.append(returned.wait(0.5))
+    def compile_other(number):
+        assert returned.wait(10), "the caller waits for the compilation"
+        order.append(number)
 
-    compiled = compile_in_background(trainer, {}, {}, 1, [compile_other, compile_other], wait)
+    others = [functools.partial(compile_other, number) for number in range(3)]
+    program, *futures = compile_in_background(trainer, {}, {}, 1, others)
     returned.set()
-    assert compiled.result() == "the program"
-    if wait:
-        assert others == [False, False]
-    else:
-        assert others in ([], [True], [True, True])
+    assert program.result() == "the program"
+    for future in futures:
+        future.result()
+    assert order == [0, 1, 2]
