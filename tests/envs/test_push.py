@@ -112,9 +112,14 @@ def shown(env):
 
 
 def test_what_is_planned_is_what_its_version_says(env, shown):
-    """Compares tasks, scenes, physics, controller, tactics and noise: the first demonstration, at every tenth step."""
+    """Compares tasks, scenes, physics, controller, tactics and noise: the first demonstration, at every tenth step.
+
+    And the controls of planners by sampling.
+    """
     tasks, states, actions = shown
-    seen = tasks.shape[0], tasks.size[0], states.qpos[0, ::10], actions[0, ::10]
+    steering, start = env.steering, jax.tree.map(lambda x: x[0, 0], states)
+    controls = steering.low, steering.high, steering.deviation, steering.action(start, 0.5 * steering.deviation)
+    seen = tasks.shape[0], tasks.size[0], states.qpos[0, ::10], actions[0, ::10], *controls
     planned.check("push", [env.version, VERSION], np.concatenate([np.ravel(x) for x in seen]), atol=1e-4)
 
 
