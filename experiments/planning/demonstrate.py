@@ -4,6 +4,7 @@
     python experiments/planning/demonstrate.py --envs=reach --envs=place --scenes=512 --batch=128
     python experiments/planning/demonstrate.py --envs=place --scenes=64 --batch=64    # on two cores
     python experiments/planning/demonstrate.py --envs=grasp --expert=receding --scenes=512
+    python experiments/planning/demonstrate.py --envs=grasp --expert=receding --scenes=512 --physics=warp
 
 Plans as a run with this `data.expert` does (`milx.data.experts`). With "sampling" the plans with which all scenes begin
 are searched for first, in 256 other scenes. Nothing comes from a cache. No setting was chosen by these scenes. All of
@@ -24,7 +25,7 @@ from absl import app, flags
 import milx
 from milx import envs
 from milx.config.assemble import make_config
-from milx.config.schema import DataConfig
+from milx.config.schema import PHYSICS, DataConfig
 from milx.core import files
 from milx.data import experts
 from milx.data.simulated import collect
@@ -75,7 +76,8 @@ def main(_: list[str]) -> None:
         expert = _EXPERT.value
         changes: dict[str, Any] = {"expert": expert, "plan_iterations": ITERATIONS[expert], "plan_batch": _BATCH.value}
         config = dataclasses.replace(config, **changes)
-        env, settings = envs.make(name, (16, 16)), {"first_seed": FIRST_SEED}
+        env, settings = envs.make(name, (16, 16)), {"first_seed": FIRST_SEED, "physics": _PHYSICS.value}
+        env = env.by_warp() if _PHYSICS.value == "warp" else env
         settings |= (
             dataclasses.asdict(experts.SETTINGS)
             if expert == "sampling"
@@ -84,8 +86,8 @@ def main(_: list[str]) -> None:
         for found in measure(env, config, _SCENES.value):
             said = {"env": name, "data": dataclasses.asdict(config), "settings": settings}
             result = {**said, **found, **origin}
-            file = f"demonstrations-{name}.json" if expert == "sampling" else f"demonstrations-{name}-{expert}.json"
-            files.write_json(folder / file, result)
+            others = [value for value in (expert, _PHYSICS.value) if value not in ("sampling", "jax")]
+            files.write_json(folder / f"{'-'.join(['demonstrations', name, *others])}.json", result)
             (low, high), newest = found["wilson95"], found["success_by_batch"][-1]
             total = found["seconds"]["total, with compilation"]
             print(
@@ -98,6 +100,7 @@ def main(_: list[str]) -> None:
 if __name__ == "__main__":
     _ENVS = flags.DEFINE_multi_enum("envs", ["push"], list(envs.ENVS), "Which environments (repeat the flag).")
     _EXPERT = flags.DEFINE_enum("expert", "sampling", list(ITERATIONS), "Who demonstrates.")
+    _PHYSICS = flags.DEFINE_enum("physics", "jax", list(PHYSICS), "Who steps the worlds.")
     _SCENES = flags.DEFINE_integer("scenes", 9216, "Scenes, each of another task.", lower_bound=1)
     _BATCH = flags.DEFINE_integer("batch", 512, "Scenes at once.", lower_bound=1)
     _OUT = flags.DEFINE_string("out", "experiments/results/planning", "Folder of the JSON files.")
