@@ -1,4 +1,4 @@
-"""Times physics of the push-sized world: substeps in milx, MJX, MJX-Warp and `mujoco.rollout`, and Jacobians.
+"""Times physics of the push-sized world: substeps in milx and MJX, by JAX and by Warp, `mujoco.rollout`; Jacobians.
 
 python experiments/benchmarks/physics.py
 """
@@ -100,10 +100,10 @@ def main(_: list[str]) -> None:
     worlds = _WORLDS.value or (8192 if accelerated else 64)
     points = _POINTS.value or (2048 if accelerated else 32)
     note, unit = f"{worlds} worlds, nv = {env.mj_model.nv}, {env.mj_model.npair} contact pairs, apart", "substeps/s"
-    report.measure("milx, Env.step", unit, lambda: measure_milx(env, worlds), note)
-    report.attempt("milx by Warp, Env.step", unit, lambda: measure_milx(env.by_warp(), worlds), note)
-    report.attempt("MJX-JAX, mjx.step", unit, lambda: measure_mjx(env, worlds, "jax"), note)
-    report.attempt("MJX-Warp, mjx.step", unit, lambda: measure_mjx(env, worlds, "warp"), note)
+    report.measure("milx, JAX", unit, lambda: measure_milx(env, worlds), note)
+    report.attempt("milx, Warp", unit, lambda: measure_milx(env.by_warp(), worlds), note)
+    report.attempt("MJX, JAX", unit, lambda: measure_mjx(env, worlds, "jax"), note)
+    report.attempt("MJX, Warp", unit, lambda: measure_mjx(env, worlds, "warp"), note)
     threads = os.cpu_count() or 1
     report.attempt("mujoco.rollout", unit, lambda: measure_rollout(env, worlds, threads), f"{threads} threads")
     for how in ("jacfwd", "mapped jvp"):

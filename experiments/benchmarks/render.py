@@ -3,8 +3,8 @@
     python experiments/benchmarks/render.py
 
 From poses (after forward kinematics) to RGB, first with shadows, which favors MJX-Warp since milx's kernel knows none,
-then without. MJX-Warp needs the package warp-lang and a GPU. It has to build its bounding volumes anew for new poses,
-and is timed without that first, which favors it, too.
+then without. MJX-Warp needs the package warp-lang and a GPU. It refits its bounding volume hierarchy to new poses, and
+is timed without that first, which favors it, too.
 """
 
 import os
@@ -59,8 +59,8 @@ def measure_warp(
         image_shape: (H, W).
         qpos: [N, nq] of N scenes.
         mocap_pos: [N, nmocap, 3] of the same.
-        shadows: whether lights throw them.
-        refit: whether bounding volumes are built anew for every batch of poses, or kept from the first.
+        shadows: whether lights cast shadows.
+        refit: whether the bounding volume hierarchy is refitted for every batch of poses, or only for the first.
     """
     import warp  # noqa: F401  without it MJX fails later and says less
 
@@ -136,18 +136,19 @@ def measure_milx(scenes: Scene, draw: Callable[[Scene], jax.Array]) -> tuple[flo
     return 1e3 * len(scenes.cam_xpos) / common.median_ms(compiled, scenes), common.gib(compiled)
 
 
-def compare(report: common.Report, env: Env, count: int, shadows: bool) -> None:
+def measure_all(report: common.Report, env: Env, count: int, shadows: bool) -> None:
     """Adds all rows of an environment with or without shadows, `count` images at once."""
     (height, width), note = env.image_shape, f"{count} at once"
     name = f"{env.name}, {env.mj_model.ngeom} geoms, {width}x{height}{', shadows' if shadows else ''}"
     unit, scenes = "frames/s", random_scenes(env, count)
     renderer = Renderer(env.mj_model, env.camera, height, width, shadows=shadows)
-    report.measure(f"{name}: milx", unit, functools.partial(measure_milx, scenes, renderer.pixels), note)
-    if common.accelerated() and not shadows:
+    if not (common.accelerated() and shadows):
+        report.measure(f"{name}: milx", unit, functools.partial(measure_milx, scenes, renderer.pixels), note)
+    if common.accelerated():
         draw = functools.partial(draw_by_xla, renderer)
         report.measure(f"{name}: milx, XLA", unit, functools.partial(measure_milx, scenes, draw), note)
     warp = functools.partial(measure_warp_in, env, count, shadows)
-    report.attempt(f"{name}: MJX-Warp, volumes kept", unit, functools.partial(warp, refit=False), note)
+    report.attempt(f"{name}: MJX-Warp, not refitted", unit, functools.partial(warp, refit=False), note)
     report.attempt(f"{name}: MJX-Warp", unit, functools.partial(warp, refit=True), note)
     opengl = functools.partial(measure_opengl_elsewhere, env, shadows)
     report.attempt(f"{name}: mujoco.Renderer", unit, opengl, "one by one")
@@ -159,7 +160,7 @@ def main(_: list[str]) -> None:
     report = common.Report("render", pathlib.Path(_OUT.value))
     count = _FRAMES.value or (64 if not common.accelerated() else 4096)
     for env, shadows in itertools.product((push_sized.PushSized(), envs.make("reach")), (True, False)):
-        compare(report, env, count, shadows)
+        measure_all(report, env, count, shadows)
 
 
 if __name__ == "__main__":
