@@ -11,6 +11,7 @@ is what takes too long there.
 
 import itertools
 import json
+import os
 import pathlib
 import statistics
 import subprocess
@@ -20,6 +21,8 @@ import time
 from typing import Any
 
 from absl import app, flags
+
+from milx.evaluation import provenance
 
 ON_CPUS = ("meta_step", "few_shot", "physics", "render", "latency", "deploy", "main_command")
 """The scripts that a CPU runs, too."""
@@ -60,10 +63,11 @@ def merged(runs: list[dict[str, Any]]) -> dict[str, Any]:
     return runs[-1] | {"rows": list(rows.values())}
 
 
-def run(name: str, arguments: list[str], folder: pathlib.Path) -> bool:
-    """Runs a benchmark, which writes its files to a folder, and tells whether it worked."""
-    began = time.perf_counter()
-    done = subprocess.run([sys.executable, str(HERE / f"{name}.py"), f"--out={folder}", *arguments])
+def run(name: str, arguments: list[str], folder: pathlib.Path, commit: str | None) -> bool:
+    """Runs a benchmark of a commit, which writes its files to a folder, and tells whether it worked."""
+    began, environment = time.perf_counter(), os.environ | ({} if commit is None else {"MILX_COMMIT": commit})
+    command = [sys.executable, str(HERE / f"{name}.py"), f"--out={folder}", *arguments]
+    done = subprocess.run(command, env=environment)
     print(f"{name}: {time.perf_counter() - began:.0f} s, exit code {done.returncode}", flush=True)
     return not done.returncode
 
@@ -86,6 +90,7 @@ def _all() -> tuple[str, ...]:
 def main(_: list[str]) -> None:
     """Runs what was chosen, and says what failed."""
     out, failed = pathlib.Path(FLAGS.out).resolve(), []
+    commit = provenance.commit()  # later runs find a tree that the files of earlier ones have changed
     if "meshes" in (FLAGS.only or ()) and not FLAGS.mjcf:
         raise app.UsageError("--only=meshes: expected --mjcf, the files of models")
     names = [name for name in FLAGS.only or _all() if name != "meshes" or FLAGS.mjcf]
@@ -94,7 +99,7 @@ def main(_: list[str]) -> None:
         for number, name in itertools.product(range(FLAGS.runs), names):
             arguments = [f"--mjcf={path}" for path in FLAGS.mjcf or () if name == "meshes"]
             here = pathlib.Path(folder, name, str(number))
-            if run(name, arguments, here):
+            if run(name, arguments, here, commit):
                 worked[name].append(here)
                 merge(worked[name], out)
             else:

@@ -14,11 +14,12 @@ _PACKAGES = ("milx", "jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "
 
 
 def origin() -> dict[str, Any]:
-    """Collects commit ("-dirty" if the tree has changed; None outside a checkout), hardware and versions."""
-    return {"commit": _commit(), "hardware": _hardware(), "versions": versions(_PACKAGES)}
+    """Collects commit, hardware and versions."""
+    return {"commit": commit(), "hardware": _hardware(), "versions": versions(_PACKAGES)}
 
 
-def _commit() -> str | None:
+def commit() -> str | None:
+    """Returns the commit, "-dirty" if the tree has changed; None outside a checkout. MILX_COMMIT overrides it."""
     if "MILX_COMMIT" in os.environ:
         return os.environ["MILX_COMMIT"]
     folder = pathlib.Path(__file__).parent

@@ -12,13 +12,14 @@ import everything
 import summary
 
 SCRIPT = """
-import json, pathlib, sys
+import json, os, pathlib, sys
 folder = pathlib.Path(sys.argv[1].removeprefix("--out="))
 run = int(folder.name)
 folder.mkdir(parents=True)
 rows = [{"name": "milx", "median": [3.0, 9.0, 1.0, 2.0][run], "unit": "ms", "peak_memory_gib": run + 0.5}]
 rows += [{"name": "peer", "median": None if run == 2 else 6.0, "unit": "ms", "peak_memory_gib": None}]
-(folder / "slow.json").write_text(json.dumps({"benchmark": "slow", "rows": rows[:1] if run == 3 else rows}))
+said = {"benchmark": "slow", "commit": os.environ["MILX_COMMIT"]}
+(folder / "slow.json").write_text(json.dumps({**said, "rows": rows[:1] if run == 3 else rows}))
 sys.exit(4 if run == 1 else 0)
 """
 
@@ -39,10 +40,14 @@ def run_everything(tmp_path, monkeypatch):
     return run
 
 
-def test_runs_that_worked_are_merged_and_the_others_are_told(run_everything, tmp_path):
+def test_runs_that_worked_are_merged_and_the_others_are_told(run_everything, tmp_path, monkeypatch):
+    commits = iter(["clean", *["dirty"] * 4])  # since the files of the first run lie in the tree
+    monkeypatch.setattr(everything.provenance, "commit", lambda: next(commits))
     with pytest.raises(SystemExit, match=r"everything: failed: physics, run 2$"):
         run_everything("--only=physics", "--runs=4")
-    ours, peer = json.loads((tmp_path / "out" / "slow.json").read_text())["rows"]
+    found = json.loads((tmp_path / "out" / "slow.json").read_text())
+    assert found["commit"] == "clean"
+    ours, peer = found["rows"]
     assert (ours["median"], ours["runs"], ours["peak_memory_gib"]) == (2.0, [3.0, 1.0, 2.0], 3.5)
     assert (peer["median"], peer["runs"], peer["peak_memory_gib"]) == (6.0, [6.0, None, None], None)
 
