@@ -3,6 +3,8 @@
 import dataclasses
 import pathlib
 import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from tiny import tiny_config
@@ -85,3 +87,24 @@ def test_an_unknown_method_is_refused():
     assert cells.methods_of("reach", ["lstm", "lstm_attention"]) == ["lstm"]  # no attention over pixels
     with pytest.raises(ValueError, match="methods: got 'ltsm', expected some of contextual, lstm, lstm_attention, mil"):
         cells.methods_of("reach", ["ltsm"])
+
+
+@pytest.mark.parametrize("captures", [False, True])
+def test_all_is_compiled_before_graphs_are_captured(captures, tmp_path, monkeypatch):
+    planning, compiled, config = threading.Event(), [], tiny_config()
+
+    def compile_in_background(*_):
+        """Compiles until demonstrations are planned, which must not begin before where graphs are captured."""
+        compiled.append(thread.submit(planning.wait, 0.2 if captures else 10.0))
+        return compiled
+
+    def plan(self, config):
+        planning.set()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cells, "compile_in_background", compile_in_background)
+    monkeypatch.setattr(cells.Cells, "_first_tasks", plan)
+    monkeypatch.setattr(cells.envs.find(config.env_name), "captures_graphs", captures)
+    with ThreadPoolExecutor(max_workers=1) as thread, pytest.raises(KeyboardInterrupt):
+        cells.Cells(tmp_path, config.data.tasks).run({"cell": config})
+    assert compiled[0].result() is not captures, "whether planning began while programs were compiled"
