@@ -112,9 +112,9 @@ def shown(env):
 
 
 def test_what_is_planned_is_what_its_version_says(env, shown):
-    """Compares tasks, scenes, physics, controller, tactics and noise: the first demonstration, at every tenth step.
+    """Compares tasks, scenes, physics, controller, tactics, noise, and the controls of planners by sampling.
 
-    And the controls of planners by sampling.
+    It looks at the first demonstration, at every tenth step.
     """
     tasks, states, actions = shown
     steering, start = env.steering, jax.tree.map(lambda x: x[0, 0], states)
