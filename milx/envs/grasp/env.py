@@ -45,7 +45,7 @@ PLACED = 0.03, 0.006
 """How near the mat's center, and how low over its place there, the hand is to open, and to leave the thing (m)."""
 THING_COST, HEIGHT_COST, HAND_COST, OPEN_COST = 3.0, 15.0, 6.0, 10.0
 """Weights of the residuals (1/m)."""
-SPEED_COST, SPIN_COST, TILT_COST = 1.0, 0.03, 1.0
+SPEED_COST, SPIN_COST, TILT_COST = 1.0, 0.03, 3.0
 """Weights of the thing's velocity (s/m) and turning (s/rad), and of the sine of half the angle by which it tilts."""
 CARRIED, NEAR, FAR = 0.07, 0.024, 0.104
 """How high over its place the thing is to be carried where it is farther away than FAR as seen from above (m); nearer
@@ -104,7 +104,7 @@ class Grasp(Env[GraspTask]):
     ahead = 20
     mirror = (1, -1, 1, 1, 1, -1, 1, 1), (1, -1, 1, 1)
     action_cost = 0.02
-    version = 5
+    version = 6
 
     def __init__(self, image_shape: tuple[int, int] | None = None):
         super().__init__(_build(), image_shape)
