@@ -109,6 +109,9 @@ class Spec:
         class_indices: indices of the entries of the action that take two values, such as an open and a closed gripper.
         goal_step: the time step of a demonstration at which the robot is at its goal; None where its height tells, or
             where the goal is the end.
+        goal_within: the distance from where a demonstration ends, in the units of the state, within which the robot
+            counts as there, so that no goal is told from then on; None where it is told to the end. It is for goals
+            that are the end.
     """
 
     image_shape: ImageShape
@@ -124,6 +127,7 @@ class Spec:
     action_names: tuple[str, ...] = ()
     class_indices: tuple[int, ...] = ()
     goal_step: int | None = None
+    goal_within: float | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Returns the fields as a dictionary that can be written as JSON, with the version of their layout."""
@@ -165,6 +169,7 @@ class Spec:
             "action_names": _are_texts(spec.action_names, actions),
             "height_index": spec.height_index is None or _is_table((spec.height_index,), (1,), 0, size),
             "goal_step": spec.goal_step is None or _is_table((spec.goal_step,), (1,), 1, _LARGEST),
+            "goal_within": spec.goal_within is None or (_is_table((spec.goal_within,), (1,)) and spec.goal_within >= 0),
         }
         for name in (name for name, value in good.items() if not value):
             raise ValueError(f"{name}: got {getattr(spec, name)!r:.100}, expected what a policy of these sizes has")

@@ -35,6 +35,17 @@ def test_with_a_height_it_is_where_the_hand_comes_down_until_it_has():
     np.testing.assert_array_equal(goals(STATE, (1, 0), 2), expected)
 
 
+def test_within_a_distance_of_the_end_the_goal_is_not_told_once_the_robot_stays_there():
+    """Is 9.9, 7.1, 4.2, 2.8, 1.4 and 0 away from the end; a second time it starts where it ends."""
+    place = STATE[:, :2]
+    known = goals(STATE, (0, 1), within=2.0)
+    away = np.linalg.norm(place - place[-1], axis=1)
+    np.testing.assert_array_equal(known, np.where(away[:, None] > 2.0, place[-1], np.nan))
+    back = np.concatenate([STATE[-1:], STATE])
+    np.testing.assert_array_equal(goals(back, (0, 1), within=2.0)[:5], np.tile(place[-1], (5, 1)), "it leaves again")
+    np.testing.assert_array_equal(goals(STATE, (0, 1), within=20.0), np.full((6, 2), np.nan))
+
+
 def test_goals_are_added_to_one_demonstration_or_to_several():
     demo = Demo(state=STATE)
     np.testing.assert_array_equal(with_goals(demo, (0, 1), 2).goal, goals(STATE, (0, 1), 2))
