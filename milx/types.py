@@ -110,8 +110,8 @@ class Spec:
         goal_step: the time step of a demonstration at which the robot is at its goal; None where its height tells, or
             where the goal is the end.
         goal_within: the distance from where a demonstration ends, in the units of the state, within which the robot
-            counts as there, so that no goal is told from then on; None where it is told to the end. It is for goals
-            that are the end.
+            counts as there, so that no goal is told from then on; None where it is told to the end. It is used only
+            where the goal is the end.
     """
 
     image_shape: ImageShape

