@@ -4,7 +4,6 @@ from milx.config.registry import Overrides
 from milx.envs.place.presets import PLACE
 
 _WORLD: Overrides = {
-    "env.goal_within": 0.08,  # the hand stays over the mat for half of the episode, and would be found instead of it
     "data.tasks": 1000,
     "data.demos_per_task": 2,
     "data.noise": 0.1,
