@@ -129,6 +129,11 @@ class Spec:
     goal_step: int | None = None
     goal_within: float | None = None
 
+    @property
+    def goal_rule(self) -> dict[str, Any]:
+        """When the robot is at its goal: the arguments of `milx.data.goals.goals` but for the state and the indices."""
+        return {"height": self.height_index, "step": self.goal_step, "within": self.goal_within}
+
     def to_dict(self) -> dict[str, Any]:
         """Returns the fields as a dictionary that can be written as JSON, with the version of their layout."""
         return {"spec_version": 1, **dataclasses.asdict(self)}

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -40,23 +41,23 @@ def goals(
         low = z < (z.min() + z.max()) / 2
         reached = jnp.argmax(low & (time > jnp.argmin(low)))
         goal = place[reached]
+    elif within is None:
+        return jnp.broadcast_to(place[-1], place.shape)
     else:
-        away = jnp.linalg.norm(place - place[-1], axis=1) > (-1.0 if within is None else within)
+        away = jnp.linalg.norm(place - place[-1], axis=1) > within
         reached, goal = jnp.max(jnp.where(away, time + 1, 0)), place[-1]
     return jnp.where(time[:, None] < reached, goal, jnp.nan)
 
 
-def with_goals(
-    demo: Demo,
-    indices: tuple[int, ...],
-    height: int | None = None,
-    step: int | None = None,
-    within: float | None = None,
-) -> Demo:
-    """Adds the `goals` to demonstrations [..., T, ...], if entries of their states tell them."""
+def with_goals(demo: Demo, indices: tuple[int, ...], **rule: Any) -> Demo:
+    """Adds the `goals` to demonstrations [..., T, ...], if entries of their states tell them.
+
+    Args:
+        demo: the demonstrations.
+        indices: as in `goals`.
+        rule: the other arguments of `goals`; `Spec.goal_rule` has those of a policy.
+    """
     if demo.state is None or not indices:
         return demo
-    compute = jnp.vectorize(
-        functools.partial(goals, indices=indices, height=height, step=step, within=within), signature="(t,s)->(t,g)"
-    )
+    compute = jnp.vectorize(functools.partial(goals, indices=indices, **rule), signature="(t,s)->(t,g)")
     return dataclasses.replace(demo, goal=compute(demo.state))

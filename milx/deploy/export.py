@@ -44,7 +44,7 @@ def export(policy: Policy, out: str | pathlib.Path, shots: int = 1) -> None:
     def learn(params: Params, demo: dict[str, jax.Array]) -> Params:
         shown = Demo(**_with_state(demo, policy.spec))
         spec = policy.spec
-        shown = with_goals(shown, spec.goal_indices, spec.height_index, spec.goal_step, spec.goal_within)
+        shown = with_goals(shown, spec.goal_indices, **spec.goal_rule)
         return policy.method.adapt(params, shown)
 
     def adapt(leaves: list[jax.Array], demo: dict[str, jax.Array]) -> list[jax.Array]:

@@ -223,7 +223,7 @@ def check_demo(demo: Demo, spec: Spec, given: str = GIVEN[0]) -> Demo:
         checked = dataclasses.replace(checked, action=_check_action(demo.action, shape, spec))
     if not lead:
         checked = jax.tree.map(lambda x: x[None], checked)
-    return with_goals(checked, spec.goal_indices, spec.height_index, spec.goal_step, spec.goal_within)
+    return with_goals(checked, spec.goal_indices, **spec.goal_rule)
 
 
 def _check_action(value: Any, shape: tuple[int, ...], spec: Spec) -> Array:

@@ -45,11 +45,13 @@ def test_within_a_distance_of_the_end_the_goal_is_not_told_once_the_robot_stays_
     np.testing.assert_array_equal(goals(STATE, (0, 1), within=0.0), [end] * 5 + [unknown])
     np.testing.assert_array_equal(goals(STATE, (0,), within=1.0), [[5.0]] * 4 + [[np.nan]] * 2, "at the distance")
     np.testing.assert_array_equal(goals(STATE, (0, 1), within=20.0), [unknown] * 6)
+    np.testing.assert_array_equal(goals(STATE, (0, 1), 2, within=20.0), goals(STATE, (0, 1), 2), "the height tells")
+    np.testing.assert_array_equal(goals(STATE, (0, 1), step=2, within=20.0), goals(STATE, (0, 1), step=2))
 
 
 def test_goals_are_added_to_one_demonstration_or_to_several():
     demo = Demo(state=STATE)
-    np.testing.assert_array_equal(with_goals(demo, (0, 1), 2).goal, goals(STATE, (0, 1), 2))
+    np.testing.assert_array_equal(with_goals(demo, (0, 1), height=2).goal, goals(STATE, (0, 1), 2))
     several = with_goals(Demo(state=np.stack([STATE, STATE[::-1]])), (0, 1))
     np.testing.assert_array_equal(several.goal[:, 0], [[5.0, 9.0], [0.0, 4.0]])
     np.testing.assert_array_equal(with_goals(demo, (0, 1), step=2).goal, goals(STATE, (0, 1), step=2))
@@ -80,5 +82,5 @@ def test_a_configuration_says_when_the_robot_is_at_its_goal(monkeypatch, field, 
     assert 0 < until < 4
     np.testing.assert_allclose(demo.goal, np.where(np.arange(5)[:, None] < until, goal, np.nan), atol=1e-7)
     spec = Spec.from_dict(env.spec.to_dict())
-    same = with_goals(demo, spec.goal_indices, spec.height_index, spec.goal_step, spec.goal_within)
+    same = with_goals(demo, spec.goal_indices, **spec.goal_rule)
     np.testing.assert_array_equal(same.goal, demo.goal)
