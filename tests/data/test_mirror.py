@@ -1,11 +1,14 @@
 """Demonstrations in a mirror, one by one and in batches for training."""
 
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
 
 from milx.data import simulated as demos_lib
 from milx.data.augment import mirrored
+from milx.data.goals import with_goals
 from milx.types import Demo, TaskBatch
 
 IMAGES = np.random.default_rng(0).integers(0, 200, (3, 8, 9, 3), np.uint8)
@@ -28,6 +31,19 @@ def test_a_mirror_swaps_left_and_right_and_twice_it_changes_nothing():
     np.testing.assert_array_equal(pairs.action, np.tile(found.action, 2))
     blind = mirrored(Demo(None, demo.state, demo.action, demo.goal), mirror, (0, 2))
     assert blind.image is None
+
+
+@pytest.mark.parametrize("rule", [{}, {"height": 3}, {"step": 3}, {"within": 1.5}])
+def test_a_mirrored_demonstration_leads_to_the_mirrored_goal_and_is_silent_as_early(rule):
+    """Expects the same goals if a random walk is mirrored before its goals are told or after."""
+    state = np.random.default_rng(2).normal(size=(9, 4)).cumsum(0)
+    mirror = (1, -1, -1, 1), (-1, 1)
+    plain = Demo(state=state, action=state[:, :2])
+    told = mirrored(with_goals(plain, (0, 2), **rule), mirror, (0, 2)).goal
+    unknown = np.isnan(told).any(axis=1)
+    assert not unknown[0] and unknown[-1] == bool(rule)
+    before = dataclasses.replace(plain, state=state * np.array(mirror[0]))
+    np.testing.assert_allclose(told, with_goals(before, (0, 2), **rule).goal, atol=1e-6)
 
 
 @pytest.mark.slow
