@@ -109,9 +109,6 @@ class Spec:
         class_indices: indices of the entries of the action that take two values, such as an open and a closed gripper.
         goal_step: the time step of a demonstration at which the robot is at its goal; None where its height tells, or
             where the goal is the end.
-        goal_within: the distance from where a demonstration ends, in the units of the state, within which the robot
-            counts as there, so that no goal is told from then on; None where it is told to the end. It is used only
-            where the goal is the end.
     """
 
     image_shape: ImageShape
@@ -127,12 +124,11 @@ class Spec:
     action_names: tuple[str, ...] = ()
     class_indices: tuple[int, ...] = ()
     goal_step: int | None = None
-    goal_within: float | None = None
 
     @property
     def goal_rule(self) -> dict[str, Any]:
         """When the robot is at its goal: the arguments of `milx.data.goals.goals` but for the state and the indices."""
-        return {"height": self.height_index, "step": self.goal_step, "within": self.goal_within}
+        return {"height": self.height_index, "step": self.goal_step}
 
     def to_dict(self) -> dict[str, Any]:
         """Returns the fields as a dictionary that can be written as JSON, with the version of their layout."""
@@ -141,6 +137,8 @@ class Spec:
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> "Spec":
         """Builds a `Spec` from the result of `to_dict`, which may have been written to JSON and read back.
+
+        A field that does not exist may be None: another version of milx has it, and the policy does not use it.
 
         Raises:
             ValueError: for a field that is missing, does not exist, or has a value that is not possible.
@@ -153,7 +151,8 @@ class Spec:
         fields = {name: _as_tuple(value) for name, value in values.items() if name != "spec_version"}
         known = {field.name: field.default is dataclasses.MISSING for field in dataclasses.fields(cls)}
         for name in fields.keys() - known.keys():
-            raise ValueError(f"{name!r:.100}: no such field, expected some of {', '.join(known)}")
+            if fields.pop(name) is not None:
+                raise ValueError(f"{name!r:.100}: no such field, expected some of {', '.join(known)}")
         for name in known:
             if known[name] and name not in fields:
                 raise ValueError(f"{name}: missing, expected a value")
@@ -174,7 +173,6 @@ class Spec:
             "action_names": _are_texts(spec.action_names, actions),
             "height_index": spec.height_index is None or _is_table((spec.height_index,), (1,), 0, size),
             "goal_step": spec.goal_step is None or _is_table((spec.goal_step,), (1,), 1, _LARGEST),
-            "goal_within": spec.goal_within is None or (_is_table((spec.goal_within,), (1,)) and spec.goal_within >= 0),
         }
         for name in (name for name, value in good.items() if not value):
             raise ValueError(f"{name}: got {getattr(spec, name)!r:.100}, expected what a policy of these sizes has")

@@ -1,8 +1,7 @@
 """Grasp, which the paper does not have, by method, with milx's additions; `published.py --table=grasp` has none.
 
-Rows have the preset's 1,000 training tasks and 20,000 updates, or three times the tasks and twice the updates. Goal
-heads are told the goal to the end, or in one row until the hand arrives there. MuJoCo Warp steps their world, so the
-extra `warp` is needed.
+Rows have the preset's 1,000 training tasks and 20,000 updates, or three times the tasks and twice the updates. MuJoCo
+Warp steps their world, so the extra `warp` is needed.
 
     python experiments/paper/grasp.py            # what is missing, then the table
 
@@ -17,7 +16,6 @@ flags.adopt_module_key_flags(tables)
 
 _WARP = {"env.physics": "warp"}
 _MORE = _WARP | {"data.tasks": 3000, "train.steps": 40_000}
-_UNTIL = {"env.goal_within": 0.08}
 
 TABLE = Table(
     "grasp",
@@ -29,7 +27,6 @@ TABLE = Table(
         "mil-3000": Row("MIL + goal head, 3,000 tasks", "mil", _MORE),
         "lstm-3000": Row("LSTM + goal head, 3,000 tasks", "lstm", _MORE),
         "contextual-3000": Row("contextual + goal head, 3,000 tasks", "contextual", _MORE),
-        "mil-3000-until": Row("MIL + goal head told until the hand is there, 3,000 tasks", "mil", _MORE | _UNTIL),
     },
     shots=(1,),
 )

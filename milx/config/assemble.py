@@ -65,7 +65,8 @@ def to_dict(config: Config) -> dict[str, Any]:
 def from_dict(values: dict[str, Any]) -> Config:
     """Builds a configuration from the result of `to_dict`, which may have been written to JSON and read back.
 
-    Earlier layouts are understood, too. Fields that are missing have their defaults.
+    Earlier layouts are understood, too. Fields that are missing have their defaults. A field that does not exist may be
+    None: another version of milx has it, and the run did not use it.
 
     Raises:
         ValueError: for a field that does not exist (the message lists those that do), or a value that is not allowed.
@@ -133,9 +134,10 @@ def _fill(group: Any, values: Any, path: str) -> None:
     known = [field.name for field in dataclasses.fields(group)]
     if not isinstance(values, dict) or not all(isinstance(name, str) for name in values):
         raise ValueError(f"{path}: got {values!r}, expected a group of fields")
-    if unknown := sorted(set(values) - set(known)):
+    if unknown := sorted(name for name in values if name not in known and values[name] is not None):
         raise ValueError(f"{path}: no such field {unknown[0]!r}, expected one of {', '.join(known)}")
-    for name, value in values.items():
+    for name in (name for name in known if name in values):
+        value = values[name]
         if dataclasses.is_dataclass(getattr(group, name)):
             _fill(getattr(group, name), value, f"{path}.{name}")
         else:

@@ -37,9 +37,6 @@ class EnvConfig:
         goal_step: the time step of a demonstration at which the robot is at the goal that a goal head learns to see
             (`milx.data.goals`). None for the environment's own rule: in push where the hand comes down, and elsewhere
             where the demonstration ends.
-        goal_within: how near the end of a demonstration, in the units of the state, the robot counts as there, so that
-            no goal is told from then on and the goal head does not learn to find the hand. It is used only where the
-            goal is the end. None for the environment's own.
         physics: who steps the world, one of PHYSICS. Warp is made for NVIDIA's GPUs, and has been tried with one in a
             process. It has no derivatives, so that iLQR plans by MJX in JAX all the same. Reach and place can be
             stepped by MJX in JAX only.
@@ -48,7 +45,6 @@ class EnvConfig:
     image_shape: tuple[int, int] = number((64, 80), 1, 4096)
     action_cost: float | None = number(None, 0)
     goal_step: int | None = number(None, 1)
-    goal_within: float | None = number(None, 0)
     physics: str = "jax"
 
 

@@ -10,43 +10,30 @@ import jax.numpy as jnp
 from milx.types import Demo
 
 
-def goals(
-    state: jax.Array,
-    indices: tuple[int, ...],
-    height: int | None = None,
-    step: int | None = None,
-    within: float | None = None,
-) -> jax.Array:
+def goals(state: jax.Array, indices: tuple[int, ...], height: int | None = None, step: int | None = None) -> jax.Array:
     """Computes the goal of every time step, [T, G].
 
     It is where the robot is at a `step`, or without one, but with a `height`, where the hand first comes down from
     above the middle of its heights to below, and from then on unknown (NaN): where the hand is would be the answer
     then, and a goal head that learns to find hands does not look for what they are about to handle. With neither, it is
-    where the demonstration ends; and with `within`, unknown from when the robot comes that near for good.
+    where the demonstration ends.
 
     Args:
         state: [T, S] of all time steps.
         indices: G entries of the state that tell where the robot is.
         height: the entry that tells how high its hand is.
         step: a time step; the last one where a demonstration is shorter.
-        within: a Euclidean distance between two places, in the units of the state; used only without `height` and
-            `step`.
     """
     place, time = state[:, jnp.array(indices, int)], jnp.arange(len(state))
     if step is not None:
         reached = jnp.minimum(step, len(state) - 1)
-        goal = place[reached]
     elif height is not None:
         z = state[:, height]
         low = z < (z.min() + z.max()) / 2
         reached = jnp.argmax(low & (time > jnp.argmin(low)))
-        goal = place[reached]
-    elif within is None:
-        return jnp.broadcast_to(place[-1], place.shape)
     else:
-        away = jnp.linalg.norm(place - place[-1], axis=1) > within
-        reached, goal = jnp.max(jnp.where(away, time + 1, 0)), place[-1]
-    return jnp.where(time[:, None] < reached, goal, jnp.nan)
+        return jnp.broadcast_to(place[-1], place.shape)
+    return jnp.where(time[:, None] < reached, place[reached], jnp.nan)
 
 
 def with_goals(demo: Demo, indices: tuple[int, ...], **rule: Any) -> Demo:

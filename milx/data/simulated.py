@@ -159,7 +159,7 @@ def render_demos(env: Env, task: Task, demos: list[tuple[State, jax.Array, jax.A
     for image, (states, action, index) in zip(images, demos, strict=True):
         before = jax.tree.map(lambda x, action=action: x[: len(action)], states)
         robot = jax.vmap(env.robot_state)(before)
-        goal = goals(robot, env.goal_indices, env.height_index, env.goal_step, env.goal_within)[index]
+        goal = goals(robot, env.goal_indices, env.height_index, env.goal_step)[index]
         observed.append(Demo(image=image, state=robot[index], action=in_chunks(action, chunk)[index], goal=goal))
     return observed
 

@@ -43,8 +43,6 @@ def of_config(config: Config) -> "Env":
     env = make(config.env_name, config.env.image_shape, config.env.action_cost)
     if config.env.goal_step is not None:
         env.goal_step = config.env.goal_step
-    if config.env.goal_within is not None:
-        env.goal_within = config.env.goal_within
     return env.by_warp() if config.env.physics == "warp" else env
 
 

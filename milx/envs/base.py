@@ -33,9 +33,6 @@ class Env(World[TaskT]):
         height_index: the entry that tells how high its hand is, where it must come down to an object; None otherwise.
         goal_step: the time step of a demonstration at which the robot is at its goal; None where its height tells, or
             where the goal is the end. A configuration may override it (`env.goal_step`).
-        goal_within: how near its end the robot counts as there, in the units of its state; from then on no goal is
-            told, so that a goal head does not learn to find the hand. None where the goal is told to the end. It is
-            used only where the goal is the end, and a configuration may override it (`env.goal_within`).
         object_indices: for each of the O objects, the two entries of the state that hold its position, where the state
             tells it.
         tactics: ways in which the controller may go about a scene, in the order of preference; what the numbers mean is
@@ -59,7 +56,6 @@ class Env(World[TaskT]):
     goal_indices: tuple[int, ...] = ()
     height_index: int | None = None
     goal_step: int | None = None
-    goal_within: float | None = None
     object_indices: tuple[tuple[int, ...], ...] = ()
     tactics: tuple[float, ...] = (0.0,)
     long_chain: bool = True
@@ -164,7 +160,6 @@ class Env(World[TaskT]):
             self.object_indices,
             height_index=self.height_index,
             goal_step=self.goal_step,
-            goal_within=self.goal_within,
         )
 
     @property

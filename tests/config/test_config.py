@@ -186,6 +186,15 @@ def test_settings_that_attention_had_in_version_2_are_dropped():
         assemble.from_dict(values | {"config_version": 3})
 
 
+def test_a_field_of_another_version_may_be_none():
+    values = assemble.to_dict(default_config("mil"))
+    values["env"]["goal_within"] = None
+    assert assemble.from_dict(values) == default_config("mil")
+    values["env"]["goal_within"] = 0.08
+    with pytest.raises(ValueError, match=r"config\.env: no such field 'goal_within', expected one of image_shape"):
+        assemble.from_dict(values)
+
+
 def test_a_method_that_is_no_name_is_refused():
     with pytest.raises(ValueError, match="method"):
         assemble.from_dict({"method_name": [1]})
