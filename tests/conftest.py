@@ -35,8 +35,12 @@ gc.freeze()
 gc.set_threshold(50_000)
 
 
+@pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Puts one file that needs the tiny run first and the others last, so that no process waits for the other's run."""
+    """Puts one file that needs the tiny run first and the others last, so that no process waits for the other's run.
+
+    It is asked last, when the tests that do not run, such as the slow ones, are no longer among the items.
+    """
     needing = sorted({item.path for item in items if "trained" in getattr(item, "fixturenames", ())})
     rank = {path: 1 for path in needing} | {path: -1 for path in needing[:1]}
     items.sort(key=lambda item: rank.get(item.path, 0))

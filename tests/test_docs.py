@@ -78,7 +78,7 @@ def test_the_commands_for_demonstrations_of_ones_own_run(tmp_path, monkeypatch, 
         if words[0] == "pip":
             continue
         if "milx.train" in words:
-            words += ["--preset=cpu", "--config.train.steps=100", "--config.train.eval_every=100"]
+            words += ["--preset=cpu", *(f"--config.train.{name}=10" for name in ("steps", "log_every", "eval_every"))]
         if "milx.evaluate" in words:
             words += ["--episodes=1", "--workers=2"]
         done = subprocess.run([sys.executable, *words[1:]], cwd=tmp_path, capture_output=True, text=True)
