@@ -138,7 +138,8 @@ class Spec:
     def from_dict(cls, values: dict[str, Any]) -> "Spec":
         """Builds a `Spec` from the result of `to_dict`, which may have been written to JSON and read back.
 
-        A field that does not exist may be None: another version of milx has it, and the policy does not use it.
+        A field that does not exist is ignored if it is None, as a field is that an earlier version had and the policy
+        does not use.
 
         Raises:
             ValueError: for a field that is missing, does not exist, or has a value that is not possible.

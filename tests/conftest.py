@@ -39,7 +39,7 @@ gc.set_threshold(50_000)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Puts one file that needs the tiny run first and the others last, so that no process waits for the other's run.
 
-    It is asked last, when the tests that do not run, such as the slow ones, are no longer among the items.
+    It runs after all other hooks, when tests that are not selected, such as slow ones, have been removed.
     """
     needing = sorted({item.path for item in items if "trained" in getattr(item, "fixturenames", ())})
     rank = {path: 1 for path in needing} | {path: -1 for path in needing[:1]}

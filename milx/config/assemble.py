@@ -65,8 +65,8 @@ def to_dict(config: Config) -> dict[str, Any]:
 def from_dict(values: dict[str, Any]) -> Config:
     """Builds a configuration from the result of `to_dict`, which may have been written to JSON and read back.
 
-    Earlier layouts are understood, too. Fields that are missing have their defaults. A field that does not exist may be
-    None: another version of milx has it, and the run did not use it.
+    Earlier layouts are understood, too. Fields that are missing have their defaults. A field that does not exist is
+    ignored if it is None, as a field is that an earlier version had and the run did not set.
 
     Raises:
         ValueError: for a field that does not exist (the message lists those that do), or a value that is not allowed.

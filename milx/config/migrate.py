@@ -8,6 +8,8 @@ convolutions and of a goal head.
 from typing import Any
 
 VERSION = 3
+"""Of the layout. It must rise with a new field in which None means something else than what milx did before it, since
+unknown fields that are None are ignored."""
 
 _OF_ALL = ("loss_scale", "whiten_actions", "goal_weight", "given")
 _NETWORK: dict[Any, tuple[str, ...]] = {

@@ -186,7 +186,7 @@ def test_settings_that_attention_had_in_version_2_are_dropped():
         assemble.from_dict(values | {"config_version": 3})
 
 
-def test_a_field_of_another_version_may_be_none():
+def test_an_unknown_field_is_ignored_if_it_is_none():
     values = assemble.to_dict(default_config("mil"))
     values["env"]["goal_within"] = None
     assert assemble.from_dict(values) == default_config("mil")

@@ -34,7 +34,7 @@ def test_a_mirror_swaps_left_and_right_and_twice_it_changes_nothing():
 
 
 @pytest.mark.parametrize("rule", [{}, {"height": 3}, {"step": 3}])
-def test_a_mirrored_demonstration_leads_to_the_mirrored_goal_and_is_silent_as_early(rule):
+def test_mirrored_goals_are_those_of_the_mirrored_states(rule):
     """Expects the same goals if a random walk is mirrored before its goals are told or after."""
     state = np.random.default_rng(2).normal(size=(9, 4)).cumsum(0)
     mirror = (1, -1, -1, 1), (-1, 1)

@@ -324,3 +324,11 @@ def test_sizes_that_cannot_be_are_refused(finished, tmp_path, values):
     path.write_text(json.dumps(good | values if isinstance(values, dict) and values else values))
     with pytest.raises(ValueError, match=r"spec\.json: expected the sizes of a policy: .*(expected|no such field)"):
         read_spec(path)
+
+
+def test_an_unknown_field_of_the_sizes_is_ignored_if_it_is_none(finished, tmp_path):
+    run, _ = finished
+    good = run.folder / "spec.json"
+    path = tmp_path / "spec.json"
+    path.write_text(json.dumps(json.loads(good.read_text()) | {"new": None}))
+    assert read_spec(path) == read_spec(good)
