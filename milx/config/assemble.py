@@ -134,10 +134,10 @@ def _fill(group: Any, values: Any, path: str) -> None:
     known = [field.name for field in dataclasses.fields(group)]
     if not isinstance(values, dict) or not all(isinstance(name, str) for name in values):
         raise ValueError(f"{path}: got {values!r}, expected a group of fields")
-    if unknown := sorted(name for name in values if name not in known and values[name] is not None):
+    values = {name: value for name, value in values.items() if name in known or value is not None}
+    if unknown := sorted(set(values) - set(known)):
         raise ValueError(f"{path}: no such field {unknown[0]!r}, expected one of {', '.join(known)}")
-    for name in (name for name in known if name in values):
-        value = values[name]
+    for name, value in values.items():
         if dataclasses.is_dataclass(getattr(group, name)):
             _fill(getattr(group, name), value, f"{path}.{name}")
         else:
