@@ -1,7 +1,7 @@
 """Grasp, which the paper does not have, by method, with milx's additions; `published.py --table=grasp` has none.
 
-Rows have the preset's 1,000 training tasks and 20,000 updates, or three times the tasks and twice the updates. MuJoCo
-Warp steps their world, so the extra `warp` is needed.
+Rows have the preset's 1,000 training tasks and 20,000 updates, or three times the tasks and twice the updates; those
+with Muon have three times the tasks and 20,000 updates. MuJoCo Warp steps their world, so the extra `warp` is needed.
 
     python experiments/paper/grasp.py            # what is missing, then the table
 
@@ -16,6 +16,8 @@ flags.adopt_module_key_flags(tables)
 
 _WARP = {"env.physics": "warp"}
 _MORE = _WARP | {"data.tasks": 3000, "train.steps": 40_000}
+_MUON = _MORE | {"train.steps": 20_000, "optimizer.name": "muon"}
+_FASTER = _MUON | {"optimizer.learning_rate": 1e-3}
 
 TABLE = Table(
     "grasp",
@@ -27,6 +29,12 @@ TABLE = Table(
         "mil-3000": Row("MIL + goal head, 3,000 tasks", "mil", _MORE),
         "lstm-3000": Row("LSTM + goal head, 3,000 tasks", "lstm", _MORE),
         "contextual-3000": Row("contextual + goal head, 3,000 tasks", "contextual", _MORE),
+        "mil-muon": Row("MIL + goal head, 3,000 tasks, Muon", "mil", _MUON),
+        "mil-beginning": Row(
+            "MIL + goal head, 3,000 tasks, Muon, more of the beginning", "mil", _MUON | {"train.frame_exponent": 2.0}
+        ),
+        "lstm-muon": Row("LSTM + goal head, 3,000 tasks, Muon", "lstm", _FASTER),
+        "contextual-muon": Row("contextual + goal head, 3,000 tasks, Muon", "contextual", _FASTER),
     },
     shots=(1,),
 )

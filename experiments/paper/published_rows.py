@@ -229,10 +229,8 @@ _RELATIVES = {env: _RESULTS[env] for env in ("reach", "push")} | {
     )
 }
 
-# Demonstrations by sampling. MuJoCo Warp (extra `warp`) steps them, and the trials.
 _SAMPLING = {
     "env.goal_step": 20,
-    "env.physics": "warp",
     "data.expert": "sampling",
     "data.plan_iterations": 8,
     "data.plan_batch": 512,

@@ -115,13 +115,13 @@ def test_the_ladder_ends_with_fast(env):
     assert config == make_config(env, preset="fast", seed=0)
 
 
-def test_demonstrations_by_sampling_goals_and_physics_are_all_that_their_row_changes_of_fast():
+def test_demonstrations_by_sampling_and_goals_are_all_that_their_row_changes_of_fast():
     row = published_rows.TABLES["experts"]["push-sampling"]
     config = dataclasses.replace(published_rows.configure(row, 1, seed=0), preset="fast")
     fast = make_config("push", preset="fast", seed=0)
     evaluation = dataclasses.replace(fast.evaluation, baseline_trials=1)
     assert config == dataclasses.replace(fast, env=config.env, data=config.data, evaluation=evaluation)
-    assert config.env == dataclasses.replace(fast.env, goal_step=20, physics="warp")
+    assert config.env == dataclasses.replace(fast.env, goal_step=20)
     planned = {"expert": "sampling", "plan_iterations": 8, "plan_batch": 512}
     assert config.data == dataclasses.replace(fast.data, **planned)
 
