@@ -17,7 +17,7 @@ from milx.envs.base import Env
 from milx.trajopt import expert, receding
 from milx.trajopt.expert import Sampling
 from milx.trajopt.ilqr import Options
-from milx.trajopt.planner import Plans, Settings, find_plans, share_plans
+from milx.trajopt.planner import Plans, Settings, find_plans, no_plans, share_plans
 
 EXPERTS = ("ilqr", "sampling", "receding")
 SETTINGS = Settings()
@@ -45,7 +45,9 @@ def expert_of(env: Env, config: DataConfig) -> Options | Sampling | receding.Set
         search = dataclasses.replace(RECEDING.search, iterations=config.plan_iterations)
         return dataclasses.replace(RECEDING, search=search)
     search = dataclasses.replace(SETTINGS.search, iterations=config.plan_iterations)
-    return Sampling(dataclasses.replace(SETTINGS, search=search), _plans(env, SETTINGS, config.noise))
+    return Sampling(
+        dataclasses.replace(SETTINGS, search=search), _plans(env, SETTINGS, config.noise, config.plan_batch)
+    )
 
 
 def description(env: Env, config: DataConfig) -> list:
@@ -82,11 +84,14 @@ def digest(env: Env, *request: Any) -> str:
 
 
 @functools.cache
-def _plans(env: Env, settings: Settings, noise: float) -> Plans:
+def _plans(env: Env, settings: Settings, noise: float, batch: int) -> Plans:
     key = jax.random.key(0)
-    find = functools.partial(find_plans, env, settings, noise, key)
     path = platform.cache_folder() / "plans" / f"{env.name}-{digest(env, repr(settings), noise)}.npz"
-    plans = pytrees.kept(path, lambda: share_plans(env, settings, find(), noise, key), lambda: jax.eval_shape(find))
+
+    def make() -> Plans:
+        return share_plans(env, settings, find_plans(env, settings, noise, key, batch), noise, key, batch)
+
+    plans = pytrees.kept(path, make, lambda: jax.eval_shape(lambda: no_plans(env, settings, key)))
     if (succeeded := int(plans.success.sum())) < settings.scenes / 2:
         begin = f"of the {settings.scenes} plans with which demonstrations of {env.name} begin"
         warn(

@@ -15,12 +15,13 @@ Reference:
 
 import dataclasses
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from milx.core import parallel
+from milx.core.batching import map_in_chunks
 from milx.envs.base import Env, State, Task
 from milx.trajopt import replanning, sampling
 from milx.trajopt.episode import approximated, steered
@@ -39,7 +40,7 @@ class Settings:
 
     Attributes:
         scenes: M, in which plans are searched for from nothing, for other scenes to begin with.
-        from_nothing: iterations of those searches.
+        from_nothing: iterations of those searches, in multiples of `search.iterations`.
         rounds: how often these scenes begin again with each other's plans.
         search: how a plan is improved that begins with those of other scenes.
         again: how what is left of a plan is planned again, with a spline of the same order.
@@ -132,11 +133,6 @@ class Planner:
         options = dataclasses.replace(self.settings.search, iterations=iterations)
         return sampling.solve(self.problem(task, start), start.vector, search, self.env.horizon, key, options)
 
-    def search_from(self, task: Task, start: State, plans: Plans) -> Search:
-        """Searches from the plans of others, with the same candidates in all scenes."""
-        iterations = self.settings.search.iterations
-        return self.improve(task, start, self.begin_from(task, start, plans), jax.random.key(_FIRST), iterations)
-
     def execute(
         self, task: Task, start: State, search: Search, key: jax.Array, noise: jax.Array | float, tracking: bool = True
     ) -> tuple[State, jax.Array]:
@@ -178,7 +174,6 @@ class Planner:
         return self.settings.near * self._steering.deviation
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1))
 def demonstrate(
     env: Env,
     settings: Settings,
@@ -202,41 +197,48 @@ def demonstrate(
     Returns:
         The states, with leading axes [N, T + 1], and the actions without noise [N, T, A].
     """
-
-    def one(plans: Plans, noise: jax.Array, task: Task, start: State, key: jax.Array) -> tuple[State, jax.Array]:
-        planner = Planner(env, settings)
-        return planner.execute(task, start, planner.search_from(task, start, plans), key, noise)
-
-    batched = jax.vmap(one, in_axes=(None, None, 0, 0, 0))
-    return parallel.shard_tasks(batched, shared=2)(plans, jnp.asarray(noise, float), task, start, key)
+    search = _search_from(env, settings, plans, task, start)
+    states, actions, _ = _execute(env, settings, jnp.asarray(noise, float), task, start, search, key)
+    return states, actions
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1))
-def find_plans(env: Env, settings: Settings, noise: jax.Array | float, key: jax.Array) -> Plans:
+def no_plans(env: Env, settings: Settings, key: jax.Array) -> Plans:
+    """Describes the M scenes of `find_plans`, in which nothing has been planned."""
+    return _drawn(env, settings, key)[-1]
+
+
+def find_plans(env: Env, settings: Settings, noise: jax.Array | float, key: jax.Array, batch: int) -> Plans:
     """Searches for a plan in each of M scenes, of as many training tasks, and executes it.
+
+    Its programs are those of `demonstrate` in `batch` scenes, unless that is more than twice M.
 
     Args:
         env: the environment.
         settings: of the planner, of which `scenes` is M.
         noise: standard deviation of the noise on the actions, in their units.
         key: draws tasks, scenes, noise, and the candidates of the searches.
+        batch: scenes at once; the last ones are filled up.
 
     Returns:
         The plans [M], those that failed among them.
     """
+    task, start, search, search_key, key, plans = _drawn(env, settings, key)
 
-    def one(noise: jax.Array, key: jax.Array) -> Plans:
-        planner, (task, start, search_key, key) = Planner(env, settings), _drawn(env, key)
-        search = planner.improve(task, start, planner.begin(), search_key, settings.from_nothing)
-        states, _ = planner.execute(task, start, search, key, noise)
-        return Plans(planner.features(task, start), search.knots, env.success(task, states))
+    def find(
+        task: Task, start: State, search: Search, search_key: jax.Array, key: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        for number in range(-(-settings.from_nothing // settings.search.iterations)):
+            search = _improve(env, settings, task, start, search, _numbered(search_key, number))
+        return search.knots, _execute(env, settings, jnp.asarray(noise, float), task, start, search, key)[-1]
 
-    keys = jax.random.split(key, parallel.round_up(settings.scenes))
-    found = parallel.shard_tasks(jax.vmap(one, in_axes=(None, 0)), shared=1)(jnp.asarray(noise, float), keys)
-    return jax.tree.map(lambda x: x[: settings.scenes], found)
+    size = min(batch, 2 * settings.scenes)
+    knots, success = map_in_chunks(find, (task, start, search, search_key, key), size, counted=False)
+    return plans._replace(knots=knots, success=success)
 
 
-def share_plans(env: Env, settings: Settings, plans: Plans, noise: jax.Array | float, key: jax.Array) -> Plans:
+def share_plans(
+    env: Env, settings: Settings, plans: Plans, noise: jax.Array | float, key: jax.Array, batch: int
+) -> Plans:
     """Lets the scenes of `find_plans` begin again with each other's plans, in rounds.
 
     In each round every scene plans, beginning with the cheapest of the plans of the nearest scenes in which one
@@ -249,37 +251,89 @@ def share_plans(env: Env, settings: Settings, plans: Plans, noise: jax.Array | f
         plans: what `find_plans` returned for the other arguments.
         noise: standard deviation of the noise on the actions, in their units.
         key: draws tasks, scenes and noise.
+        batch: as in `find_plans`.
 
     Returns:
         The plans [M].
     """
     if plans.success.any():
         for number in range(settings.rounds):
-            plans = _shared(env, settings, plans, noise, key, jnp.int32(number))
+            plans = _shared(env, settings, plans, noise, key, number, batch)
     return plans
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1))
 def _shared(
-    env: Env, settings: Settings, plans: Plans, noise: jax.Array | float, key: jax.Array, number: jax.Array
+    env: Env, settings: Settings, plans: Plans, noise: jax.Array | float, key: jax.Array, number: int, batch: int
 ) -> Plans:
     """Runs one round of `share_plans`."""
+    task, start, _, _, key, _ = _drawn(env, settings, key)
 
-    def one(plans: Plans, noise: jax.Array, number: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        planner, (task, start, _, key) = Planner(env, settings), _drawn(env, key)
-        search = planner.search_from(task, start, plans)
-        states, _ = planner.execute(task, start, search, jax.random.fold_in(key, 1 + number), noise)
-        return search.knots, env.success(task, states)
+    def again(task: Task, start: State, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        search = _search_from(env, settings, plans, task, start)
+        return search.knots, _execute(env, settings, jnp.asarray(noise, float), task, start, search, key)[-1]
 
-    keys = jax.random.split(key, parallel.round_up(settings.scenes))
-    batched = parallel.shard_tasks(jax.vmap(one, in_axes=(None, None, None, 0)), shared=3)
-    found = batched(plans, jnp.asarray(noise, float), number, keys)
-    knots, success = jax.tree.map(lambda x: x[: settings.scenes], found)
+    scenes = task, start, _numbered(key, 1 + number)
+    knots, success = map_in_chunks(again, scenes, min(batch, 2 * settings.scenes), counted=False)
     return plans._replace(knots=jnp.where(success[:, None, None], knots, plans.knots), success=plans.success | success)
 
 
-def _drawn(env: Env, key: jax.Array) -> tuple[Task, State, jax.Array, jax.Array]:
-    """Draws a training task, its scene, and keys for a search and its execution."""
-    task_key, scene_key, search_key, key = jax.random.split(key, 4)
-    task = env.sample_task(task_key, "train")
-    return task, env.reset(scene_key, task), search_key, key
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _drawn(env: Env, settings: Settings, key: jax.Array) -> tuple[Task, State, Search, jax.Array, jax.Array, Plans]:
+    """Draws M training tasks with their scenes, and keys for searches and executions; begins all searches."""
+    planner = Planner(env, settings)
+
+    def one(key: jax.Array) -> tuple[Task, State, Search, jax.Array, jax.Array, Plans]:
+        task_key, scene_key, search_key, key = jax.random.split(key, 4)
+        task = env.sample_task(task_key, "train")
+        start, search = env.reset(scene_key, task), planner.begin()
+        return (
+            task,
+            start,
+            search,
+            search_key,
+            key,
+            Plans(planner.features(task, start), search.knots, jnp.array(False)),
+        )
+
+    return jax.vmap(one)(jax.random.split(key, settings.scenes))
+
+
+_numbered = jax.jit(jax.vmap(jax.random.fold_in, in_axes=(0, None)))
+
+
+# All that is planned goes through these three programs, so that each is compiled once. A search from nothing repeats
+# the second.
+
+
+def _search_from(env: Env, settings: Settings, plans: Plans, task: Task, start: State) -> Search:
+    """Searches from the plans of others, with the same candidates in all scenes."""
+    search = _begin_from(env, settings, parallel.replicate(plans), task, start)
+    key = parallel.replicate(jnp.broadcast_to(jax.random.key(_FIRST), len(start.qpos)))
+    return _improve(env, settings, task, start, search, key)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _begin_from(env: Env, settings: Settings, plans: Plans, task: Task, start: State) -> Search:
+    def one(plans: Plans, task: Task, start: State) -> Search:
+        return Planner(env, settings).begin_from(task, start, plans)
+
+    return parallel.shard_tasks(jax.vmap(one, in_axes=(None, 0, 0)), shared=1)(plans, task, start)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _improve(env: Env, settings: Settings, *batch: Any) -> Search:
+    improve = functools.partial(Planner(env, settings).improve, iterations=settings.search.iterations)
+    return parallel.shard_tasks(jax.vmap(improve))(*batch)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _execute(env: Env, settings: Settings, noise: jax.Array, *batch: Any) -> tuple[State, jax.Array, jax.Array]:
+    """Returns states, actions, and whether they succeed."""
+
+    def one(
+        noise: jax.Array, task: Task, start: State, search: Search, key: jax.Array
+    ) -> tuple[State, jax.Array, jax.Array]:
+        states, actions = Planner(env, settings).execute(task, start, search, key, noise)
+        return states, actions, env.success(task, states)
+
+    return parallel.shard_tasks(jax.vmap(one, in_axes=(None, 0, 0, 0, 0)), shared=1)(noise, *batch)

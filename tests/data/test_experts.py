@@ -75,14 +75,14 @@ def test_plans_are_found_once_and_kept(env, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(
         experts,
         "find_plans",
-        lambda env, settings, noise, key: Plans(
+        lambda env, settings, noise, key, batch: Plans(
             rng.random((8, 15), "float32"), rng.random((8, settings.knots, 6), "float32"), np.arange(8) < good[0]
         ),
     )
 
     asked = []
 
-    def share(env, settings, plans, noise, key):
+    def share(env, settings, plans, noise, key, batch):
         asked.append((noise, key))
         return plans._replace(knots=plans.knots + 1)
 
