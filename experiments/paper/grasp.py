@@ -17,6 +17,7 @@ flags.adopt_module_key_flags(tables)
 _WARP = {"env.physics": "warp"}
 _MORE = _WARP | {"data.tasks": 3000, "train.steps": 40_000}
 _MUON = _MORE | {"train.steps": 20_000, "optimizer.name": "muon"}
+_BEGINNING = _MUON | {"train.frame_exponent": 2.0}
 _FASTER = _MUON | {"optimizer.learning_rate": 1e-3}
 
 TABLE = Table(
@@ -30,8 +31,11 @@ TABLE = Table(
         "lstm-3000": Row("LSTM + goal head, 3,000 tasks", "lstm", _MORE),
         "contextual-3000": Row("contextual + goal head, 3,000 tasks", "contextual", _MORE),
         "mil-muon": Row("MIL + goal head, 3,000 tasks, Muon", "mil", _MUON),
-        "mil-beginning": Row(
-            "MIL + goal head, 3,000 tasks, Muon, more of the beginning", "mil", _MUON | {"train.frame_exponent": 2.0}
+        "mil-beginning": Row("MIL + goal head, 3,000 tasks, Muon, more of the beginning", "mil", _BEGINNING),
+        "mil-frames": Row(
+            "MIL + goal head, 3,000 tasks, Muon, more of the beginning, 16 time steps of the query",
+            "mil",
+            _BEGINNING | {"train.query_frames": 16},
         ),
         "lstm-muon": Row("LSTM + goal head, 3,000 tasks, Muon", "lstm", _FASTER),
         "contextual-muon": Row("contextual + goal head, 3,000 tasks, Muon", "contextual", _FASTER),

@@ -91,6 +91,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "published-baselines": lambda: _published("", "baselines"),
     "published-ladder": lambda: _published("", "ladder"),
     "published-relatives": lambda: _published("", "relatives"),
+    "published-experts": lambda: _published("", "experts"),
     "figure3": lambda: figure3.markdown(list(cells.read(RESULTS / "figure3").values())),
     "figure3-paper": lambda: figure3.markdown(list(cells.read(RESULTS / "figure3_paper").values())),
     "figure3-push": lambda: figure3.markdown(list(cells.read(RESULTS / "figure3_push").values())),
