@@ -18,7 +18,7 @@ _WARP = {"env.physics": "warp"}
 _MORE = _WARP | {"data.tasks": 3000, "train.steps": 40_000}
 _MUON = _MORE | {"train.steps": 20_000, "optimizer.name": "muon"}
 _BEGINNING = _MUON | {"train.frame_exponent": 2.0}
-_FASTER = _MUON | {"optimizer.learning_rate": 1e-3}
+_OTHERS = _MUON | {"optimizer.learning_rate": 1e-3}
 
 TABLE = Table(
     "grasp",
@@ -37,8 +37,8 @@ TABLE = Table(
             "mil",
             _BEGINNING | {"train.query_frames": 16},
         ),
-        "lstm-muon": Row("LSTM + goal head, 3,000 tasks, Muon", "lstm", _FASTER),
-        "contextual-muon": Row("contextual + goal head, 3,000 tasks, Muon", "contextual", _FASTER),
+        "lstm-muon": Row("LSTM + goal head, 3,000 tasks, Muon", "lstm", _OTHERS),
+        "contextual-muon": Row("contextual + goal head, 3,000 tasks, Muon", "contextual", _OTHERS),
     },
     shots=(1,),
 )

@@ -15,9 +15,10 @@ from milx.core import platform, pytrees
 from milx.core.messages import warn
 from milx.envs.base import Env
 from milx.trajopt import expert, receding
+from milx.trajopt.demonstrations import find_plans, no_plans, share_plans
 from milx.trajopt.expert import Sampling
 from milx.trajopt.ilqr import Options
-from milx.trajopt.planner import Plans, Settings, find_plans, no_plans, share_plans
+from milx.trajopt.planner import Plans, Settings
 
 EXPERTS = ("ilqr", "sampling", "receding")
 SETTINGS = Settings()

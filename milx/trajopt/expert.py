@@ -3,7 +3,7 @@
 The noise drives the arm off the plan and the recorded action is the feedback's answer, before the noise: a
 demonstration so shows how to recover, and its labels are clean (DART, Laskey et al. 2017). Where iLQR does not plan
 (no iterations) the feedback is the environment's controller, with a tactic that a rehearsal without noise chooses. An
-expert by sampling (`planner.py`) does the same with its own plans and its own way to follow them, and one with a
+expert by sampling (`demonstrations.py`) does the same with its own plans and its own way to follow them, and one with a
 receding horizon (`receding.py`) plans again where the noise has driven it.
 """
 
@@ -18,7 +18,7 @@ import numpy as np
 from milx.core import parallel
 from milx.core.batching import map_in_chunks
 from milx.envs.base import Env, State, Task
-from milx.trajopt import planner, receding
+from milx.trajopt import demonstrations, receding
 from milx.trajopt.episode import problem_of
 from milx.trajopt.ilqr import Options, Plan, solve
 from milx.trajopt.planner import Plans, Settings
@@ -114,7 +114,7 @@ def perform(
     if isinstance(options, receding.Settings):
         return receding.demonstrate(env, options, noise, task, state, key)
     if isinstance(options, Sampling):
-        return planner.demonstrate(env, options.settings, options.plans, noise, task, state, key)
+        return demonstrations.demonstrate(env, options.settings, options.plans, noise, task, state, key)
     if options.iterations:
         return _perform_planned(env, options, noise, task, state, key)
     if tactic is None:

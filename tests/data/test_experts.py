@@ -83,7 +83,7 @@ def test_plans_are_found_once_and_kept(env, tmp_path, monkeypatch, capsys):
     asked = []
 
     def share(env, settings, plans, noise, key, batch):
-        asked.append((noise, key))
+        asked.append((noise, key, batch))
         return plans._replace(knots=plans.knots + 1)
 
     monkeypatch.setattr(experts, "share_plans", share)
@@ -91,7 +91,9 @@ def test_plans_are_found_once_and_kept(env, tmp_path, monkeypatch, capsys):
     def plans(settings, iterations, noise=0.1):
         experts._plans.cache_clear()
         monkeypatch.setattr(experts, "SETTINGS", settings)
-        expert = experts.expert_of(env, DataConfig(expert="sampling", plan_iterations=iterations, noise=noise))
+        expert = experts.expert_of(
+            env, DataConfig(expert="sampling", plan_iterations=iterations, noise=noise, plan_batch=7)
+        )
         assert expert.settings.search.iterations == iterations
         return expert.plans
 
@@ -100,7 +102,7 @@ def test_plans_are_found_once_and_kept(env, tmp_path, monkeypatch, capsys):
     for one, same in zip(first, again, strict=True):
         np.testing.assert_array_equal(one, same)
     assert first.knots.min() >= 1, "what was shared is kept"
-    assert asked == [(0.1, jax.random.key(0))] * 2
+    assert asked == [(0.1, jax.random.key(0), 7)] * 2
     assert other.knots.shape == (8, 5, 6)
     assert not np.array_equal(plans(FEW, 3, noise=0.2).knots, first.knots)
     assert len(list((tmp_path / "milx" / "plans").glob("place-*.npz"))) == 3

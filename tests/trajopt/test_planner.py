@@ -13,7 +13,7 @@ import pytest
 
 from milx.core.batching import map_in_chunks
 from milx.envs.base import State
-from milx.trajopt import planner, receding, sampling
+from milx.trajopt import demonstrations, planner, receding, sampling
 from milx.trajopt.expert import VERSION
 from milx.trajopt.planner import Planner, Plans, Settings
 from milx.trajopt.sampling import Options
@@ -21,7 +21,7 @@ from milx.trajopt.sampling import Options
 NOISE = 0.05
 SETTINGS = Settings(
     scenes=6,
-    from_nothing=6,
+    from_nothing=5,
     search=Options("cross_entropy", samples=16, iterations=3, elites=4, order=1),
     again=Options("predictive", samples=8, order=1),
     every=5,
@@ -32,7 +32,7 @@ SETTINGS = Settings(
 
 @pytest.fixture(scope="module")
 def plans(cart):
-    return planner.find_plans(cart, SETTINGS, NOISE, jax.random.key(0), 4)
+    return demonstrations.find_plans(cart, SETTINGS, NOISE, jax.random.key(0), 4)
 
 
 def cost(cart, task, start, knots):
@@ -73,17 +73,18 @@ def test_a_search_never_begins_with_a_plan_that_failed_while_there_is_one_that_s
     assert search.cost > cost(cart, task, start, knots[0])
 
 
-def test_plans_belong_to_their_scenes(cart, plans):
-    """Draws the third scene again, and searches there alone."""
-    task_key, scene_key, search_key, _ = jax.random.split(jax.random.split(jax.random.key(0), 6)[2], 4)
+@pytest.mark.parametrize("scene", [2, 5])
+def test_plans_belong_to_their_scenes(cart, plans, scene):
+    """Draws a scene of the first batch of four or of the second again, and searches there alone."""
+    task_key, scene_key, search_key, _ = jax.random.split(jax.random.split(jax.random.key(0), 6)[scene], 4)
     task = cart.sample_task(task_key, "train")
     start = cart.reset(scene_key, task)
-    np.testing.assert_allclose(plans.features[2], [float((start.qpos - task)[0]), 0.0], atol=1e-6)
+    np.testing.assert_allclose(plans.features[scene], [float((start.qpos - task)[0]), 0.0], atol=1e-6)
     alone = Planner(cart, SETTINGS)
     search = alone.begin()
-    for number in (0, 1):  # twice the iterations of a search from plans
+    for number in (0, 1):  # five iterations, in searches of three
         search = alone.improve(task, start, search, jax.random.fold_in(search_key, number), 3)
-    np.testing.assert_allclose(plans.knots[2], search.knots, atol=1e-4)
+    np.testing.assert_allclose(plans.knots[scene], search.knots, atol=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -103,7 +104,7 @@ def test_settings_that_make_no_sense_are_refused(changes, message):
 def test_plans_are_found_and_demonstrations_begin_with_them(cart, scenes, plans):
     assert plans.success.sum() >= 5
     task, start, keys = scenes
-    states, _ = planner.demonstrate(cart, SETTINGS, plans, NOISE, task, start, keys)
+    states, _ = demonstrations.demonstrate(cart, SETTINGS, plans, NOISE, task, start, keys)
     assert jax.vmap(cart.success)(task, states).mean() > 0.9
     still = jax.tree.map(lambda x: jnp.repeat(x[:, None], 13, axis=1), start)
     assert jax.vmap(cart.success)(task, still).mean() < 0.5
@@ -111,15 +112,30 @@ def test_plans_are_found_and_demonstrations_begin_with_them(cart, scenes, plans)
 
 def test_demonstrations_are_planned_by_the_programs_that_found_the_plans(cart, scenes, caplog):
     """From nothing, in rounds and from plans: of each large program one is compiled."""
-    settings, noise = dataclasses.replace(SETTINGS, rounds=1, scenes=4), jnp.float32(NOISE)
+    settings = dataclasses.replace(SETTINGS, rounds=1, scenes=4)
     task, start, keys = jax.tree.map(lambda x: x[:7], scenes)
     with jax.log_compiles():
-        found = planner.find_plans(cart, settings, noise, jax.random.key(0), 5)
-        found = planner.share_plans(cart, settings, found, noise, jax.random.key(0), 5)
-        make = functools.partial(planner.demonstrate, cart, settings, found, noise)
+        found = demonstrations.find_plans(cart, settings, NOISE, jax.random.key(0), 5)
+        found = demonstrations.share_plans(cart, settings, found, NOISE, jax.random.key(0), 5)
+        make = functools.partial(demonstrations.demonstrate, cart, settings, found, NOISE)
         map_in_chunks(make, (task, start, keys), 5)
     counts = [caplog.text.count(f"XLA compilation of jit({name})") for name in ("_begin_from", "_improve", "_execute")]
     assert counts == [1, 1, 1]
+
+
+@pytest.mark.parametrize(("batch", "expected"), [(5, [5, 5]), (12, [12]), (13, [6])])
+def test_no_more_than_half_of_a_batch_is_planned_in_vain(cart, monkeypatch, batch, expected):
+    sizes = []
+
+    def improve(env, settings, task, start, search, keys):
+        sizes.append(len(keys))
+        return search
+
+    monkeypatch.setattr(demonstrations, "_improve", improve)
+    monkeypatch.setattr(demonstrations, "_execute", lambda *args: (jnp.zeros(len(args[-1]), bool),))
+    settings = dataclasses.replace(SETTINGS, from_nothing=1)
+    found = demonstrations.find_plans(cart, settings, NOISE, jax.random.key(0), batch)
+    assert (sizes, len(found.success)) == (expected, 6)
 
 
 @pytest.mark.slow
@@ -129,7 +145,7 @@ def test_scenes_begin_again_with_each_other_s_plans(cart, plans):
     given = plans._replace(knots=plans.knots.at[4:].add(0.05), success=jnp.asarray(kept))
     alone = Planner(cart, SETTINGS)
     for number in (0, 1):
-        shared = planner._shared(cart, SETTINGS, given, NOISE, jax.random.key(0), number, 4)
+        shared = demonstrations._shared(cart, SETTINGS, given, NOISE, jax.random.key(0), number, 4)
         for scene, key in enumerate(jax.random.split(jax.random.key(0), 6)):
             task_key, scene_key, _, key = jax.random.split(key, 4)
             task = cart.sample_task(task_key, "train")
@@ -153,14 +169,14 @@ def test_plans_are_shared_in_rounds_where_one_has_succeeded(cart, plans, monkeyp
         numbers.append(number)
         return plans
 
-    monkeypatch.setattr(planner, "_shared", shared)
+    monkeypatch.setattr(demonstrations, "_shared", shared)
     given = plans._replace(success=jnp.arange(6) < succeeded)
-    planner.share_plans(cart, dataclasses.replace(SETTINGS, rounds=rounds), given, NOISE, jax.random.key(0), 4)
+    demonstrations.share_plans(cart, dataclasses.replace(SETTINGS, rounds=rounds), given, NOISE, jax.random.key(0), 4)
     assert numbers == expected
 
 
 def test_what_is_executed_is_what_was_recorded_and_noise(cart, scenes, plans):
-    demonstrate = functools.partial(planner.demonstrate, cart, SETTINGS, plans)
+    demonstrate = functools.partial(demonstrations.demonstrate, cart, SETTINGS, plans)
     cart_laws.check_that_noise_alone_is_not_recorded(demonstrate, scenes, NOISE)
 
 
@@ -187,13 +203,13 @@ def test_a_plan_that_is_kept_is_tracked_in_the_world(cart, scenes):
 
 
 def test_only_noise_tells_two_demonstrations_of_a_scene_apart(cart, scenes, plans):
-    demonstrate = functools.partial(planner.demonstrate, cart, SETTINGS, plans)
+    demonstrate = functools.partial(demonstrations.demonstrate, cart, SETTINGS, plans)
     cart_laws.check_that_noise_alone_tells_demonstrations_of_a_scene_apart(demonstrate, scenes, NOISE)
 
 
 def test_what_is_sampled_is_what_its_version_says(cart, scenes, plans):
     few = jax.tree.map(lambda x: x[:3], scenes)
-    _, whole = planner.demonstrate(cart, SETTINGS, plans, NOISE, *few)
+    _, whole = demonstrations.demonstrate(cart, SETTINGS, plans, NOISE, *few)
     ahead = receding.Settings(search=SETTINGS.search)
     _, next_steps = receding.demonstrate(cart, ahead, NOISE, *few)
     planned.check("cart", [VERSION], np.concatenate([whole.ravel(), next_steps.ravel()]), atol=1e-4)
@@ -202,8 +218,8 @@ def test_what_is_sampled_is_what_its_version_says(cart, scenes, plans):
 def test_scenes_do_not_depend_on_those_beside_them(cart, scenes, plans):
     task, start, keys = scenes
     few = lambda tree: jax.tree.map(lambda x: x[:8], tree)  # noqa: E731
-    states, actions = planner.demonstrate(cart, SETTINGS, plans, NOISE, task, start, keys)
-    alone, of_them = planner.demonstrate(cart, SETTINGS, plans, NOISE, few(task), few(start), keys[:8])
+    states, actions = demonstrations.demonstrate(cart, SETTINGS, plans, NOISE, task, start, keys)
+    alone, of_them = demonstrations.demonstrate(cart, SETTINGS, plans, NOISE, few(task), few(start), keys[:8])
     np.testing.assert_allclose(of_them, actions[:8], atol=1e-4)
     np.testing.assert_allclose(alone.qpos, states.qpos[:8], atol=1e-4)
 
