@@ -20,7 +20,8 @@ from milx.data.augment import mirrored
 from milx.data.frames import frame_indices, in_chunks
 from milx.data.goals import goals
 from milx.envs.base import Env, State, Task
-from milx.trajopt.expert import choose_tactics, judge, perform
+from milx.trajopt.episode import judge
+from milx.trajopt.expert import choose_tactics, perform
 from milx.types import SPLITS, Demo, TaskBatch
 
 

@@ -23,7 +23,8 @@ from milx.evaluation.intervals import bootstrap_interval, wilson_interval
 from milx.evaluation.rollout import rollout
 from milx.methods.base import Method
 from milx.methods.random import Random
-from milx.trajopt.expert import choose_tactics, judge, perform
+from milx.trajopt.episode import judge
+from milx.trajopt.expert import choose_tactics, perform
 from milx.types import Demo, Params, TaskParams
 
 _LISTENERS = 24

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from milx.core import parallel
 from milx.core.batching import map_in_chunks
 from milx.envs.base import Env, State, Task
+from milx.trajopt.episode import judge
 from milx.trajopt.planner import Planner, Plans, Settings
 from milx.trajopt.sampling import Search
 
@@ -45,8 +46,7 @@ def demonstrate(
         The states, with leading axes [N, T + 1], and the actions without noise [N, T, A].
     """
     search = _search_from(env, settings, plans, task, start)
-    states, actions, _ = _execute(env, settings, jnp.asarray(noise, float), task, start, search, key)
-    return states, actions
+    return _execute(env, settings, jnp.asarray(noise, float), task, start, search, key)
 
 
 class _Scenes(NamedTuple):
@@ -102,7 +102,8 @@ def find_plans(env: Env, settings: Settings, noise: jax.Array | float, key: jax.
     ) -> tuple[jax.Array, jax.Array]:
         for number in range(-(-settings.from_nothing // settings.search.iterations)):
             search = _improve(env, settings, task, start, search, _numbered(search_keys, number))
-        return search.knots, _execute(env, settings, jnp.asarray(noise, float), task, start, search, keys)[-1]
+        states, _ = _execute(env, settings, jnp.asarray(noise, float), task, start, search, keys)
+        return search.knots, judge(env, task, states)[0]
 
     size = _at_once(settings, batch)
     knots, success = map_in_chunks(find, scenes[:-1], size, counted=False)
@@ -143,7 +144,8 @@ def _shared(
 
     def again(task: Task, start: State, keys: jax.Array) -> tuple[jax.Array, jax.Array]:
         search = _search_from(env, settings, plans, task, start)
-        return search.knots, _execute(env, settings, jnp.asarray(noise, float), task, start, search, keys)[-1]
+        states, _ = _execute(env, settings, jnp.asarray(noise, float), task, start, search, keys)
+        return search.knots, judge(env, task, states)[0]
 
     inputs = scenes.task, scenes.start, _numbered(scenes.keys, 1 + number)
     knots, success = map_in_chunks(again, inputs, _at_once(settings, batch), counted=False)
@@ -187,13 +189,8 @@ def _improve(env: Env, settings: Settings, *batch: Any) -> Search:
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
-def _execute(env: Env, settings: Settings, noise: jax.Array, *batch: Any) -> tuple[State, jax.Array, jax.Array]:
-    """Returns states, actions, and whether they succeed."""
-
-    def one(
-        noise: jax.Array, task: Task, start: State, search: Search, key: jax.Array
-    ) -> tuple[State, jax.Array, jax.Array]:
-        states, actions = Planner(env, settings).execute(task, start, search, key, noise)
-        return states, actions, env.success(task, states)
+def _execute(env: Env, settings: Settings, noise: jax.Array, *batch: Any) -> tuple[State, jax.Array]:
+    def one(noise: jax.Array, task: Task, start: State, search: Search, key: jax.Array) -> tuple[State, jax.Array]:
+        return Planner(env, settings).execute(task, start, search, key, noise)
 
     return parallel.shard_tasks(jax.vmap(one, in_axes=(None, 0, 0, 0, 0)), shared=1)(noise, *batch)

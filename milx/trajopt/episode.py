@@ -1,10 +1,12 @@
-"""An episode of an environment as a planning problem, in its actions or in other controls."""
+"""An episode of an environment as a planning problem, in its actions or in other controls, and episodes judged."""
 
+import functools
 from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 
+from milx.core import parallel
 from milx.envs.base import Env, State, Task
 from milx.trajopt.ilqr import Problem
 
@@ -63,3 +65,13 @@ def steered(env: Env, task: Task, state: State) -> Problem:
     steering = env.steering
     law = lambda x, u: steering.action(state.with_vector(x), u)  # noqa: E731
     return with_controls(problem_of(env, task, state), law, steering.low, steering.high)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def judge(env: Env, task: Task, states: State) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """Judges a batch of episodes by success and by the environment's other criteria; all have a leading axis."""
+
+    def one(task: Task, states: State) -> tuple[jax.Array, dict[str, jax.Array]]:
+        return env.success(task, states), env.other_criteria(task, states)
+
+    return parallel.shard_tasks(jax.vmap(one))(task, states)

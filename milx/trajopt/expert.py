@@ -19,7 +19,7 @@ from milx.core import parallel
 from milx.core.batching import map_in_chunks
 from milx.envs.base import Env, State, Task
 from milx.trajopt import demonstrations, receding
-from milx.trajopt.episode import problem_of
+from milx.trajopt.episode import judge, problem_of
 from milx.trajopt.ilqr import Options, Plan, solve
 from milx.trajopt.planner import Plans, Settings
 
@@ -160,13 +160,3 @@ def _perform_controlled(env: Env, noise: float, *batch: Any) -> tuple[State, jax
         return demonstrate(env, task, state, lambda state, _: env.control(task, state, tactic), key, noise)
 
     return parallel.shard_tasks(jax.vmap(one, in_axes=(None, 0, 0, 0, 0)), shared=1)(noise, *batch)
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def judge(env: Env, task: Task, states: State) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """Judges a batch of episodes by success and by the environment's other criteria; all have a leading axis."""
-
-    def one(task: Task, states: State) -> tuple[jax.Array, dict[str, jax.Array]]:
-        return env.success(task, states), env.other_criteria(task, states)
-
-    return parallel.shard_tasks(jax.vmap(one))(task, states)

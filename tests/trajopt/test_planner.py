@@ -132,7 +132,8 @@ def test_no_more_than_half_of_a_batch_is_planned_in_vain(cart, monkeypatch, batc
         return search
 
     monkeypatch.setattr(demonstrations, "_improve", improve)
-    monkeypatch.setattr(demonstrations, "_execute", lambda *args: (jnp.zeros(len(args[-1]), bool),))
+    monkeypatch.setattr(demonstrations, "_execute", lambda *args: (None, None))
+    monkeypatch.setattr(demonstrations, "judge", lambda env, task, states: (jnp.zeros(len(task), bool), {}))
     settings = dataclasses.replace(SETTINGS, from_nothing=1)
     found = demonstrations.find_plans(cart, settings, NOISE, jax.random.key(0), batch)
     assert (sizes, len(found.success)) == (expected, 6)
