@@ -102,11 +102,9 @@ def find_plans(env: Env, settings: Settings, noise: jax.Array | float, key: jax.
     ) -> tuple[jax.Array, jax.Array]:
         for number in range(-(-settings.from_nothing // settings.search.iterations)):
             search = _improve(env, settings, task, start, search, _numbered(search_keys, number))
-        states, _ = _execute(env, settings, jnp.asarray(noise, float), task, start, search, keys)
-        return search.knots, judge(env, task, states)[0]
+        return search.knots, _succeeds(env, settings, noise, task, start, search, keys)
 
-    size = _at_once(settings, batch)
-    knots, success = map_in_chunks(find, scenes[:-1], size, counted=False)
+    knots, success = map_in_chunks(find, scenes[:-1], _at_once(settings, batch), counted=False)
     return scenes.plans._replace(knots=knots, success=success)
 
 
@@ -144,8 +142,7 @@ def _shared(
 
     def again(task: Task, start: State, keys: jax.Array) -> tuple[jax.Array, jax.Array]:
         search = _search_from(env, settings, plans, task, start)
-        states, _ = _execute(env, settings, jnp.asarray(noise, float), task, start, search, keys)
-        return search.knots, judge(env, task, states)[0]
+        return search.knots, _succeeds(env, settings, noise, task, start, search, keys)
 
     inputs = scenes.task, scenes.start, _numbered(scenes.keys, 1 + number)
     knots, success = map_in_chunks(again, inputs, _at_once(settings, batch), counted=False)
@@ -162,6 +159,20 @@ def _search_from(env: Env, settings: Settings, plans: Plans, task: Task, start: 
     search = _begin_from(env, settings, parallel.replicate(plans), task, start)
     key = parallel.replicate(jnp.broadcast_to(jax.random.key(_FIRST), len(start.qpos)))
     return _improve(env, settings, task, start, search, key)
+
+
+def _succeeds(
+    env: Env,
+    settings: Settings,
+    noise: jax.Array | float,
+    task: Task,
+    start: State,
+    search: Search,
+    keys: jax.Array,
+) -> jax.Array:
+    """Executes N plans and tells which of them succeed, [N] bool."""
+    states, _ = _execute(env, settings, jnp.asarray(noise, float), task, start, search, keys)
+    return judge(env, task, states)[0]
 
 
 @jax.jit
