@@ -6,9 +6,11 @@ becomes a batched matrix product.
 """
 
 import functools
+import math
 
 import jax
 import jax.numpy as jnp
+from jax.custom_derivatives import SymbolicZero
 
 
 def same_padding(size: int, kernel: int, stride: int) -> tuple[int, int]:
@@ -48,6 +50,43 @@ def _product(x: jax.Array, weights: jax.Array) -> jax.Array:
     return (x.reshape(-1, x.shape[-1]) @ weights).reshape(*x.shape[:-1], -1)
 
 
+@jax.custom_jvp
+def _product_by_groups(x: jax.Array, weights: jax.Array) -> jax.Array:
+    """Computes `_product` of [B, .., K] and [K, F], whose derivative x dW is one product for each group of images.
+
+    Its transpose, the gradient by W, is then a sum of several smaller products, which together keep all of a GPU busy.
+    XLA would split the product as well, but first copies x and the output's gradient to fill up their rows.
+    """
+    return _product(x, weights)
+
+
+@functools.partial(_product_by_groups.defjvp, symbolic_zeros=True)
+def _product_by_groups_jvp(primals: tuple, tangents: tuple) -> tuple[jax.Array, jax.Array]:
+    """Computes x W, and dx W + x dW."""
+    (x, weights), (dx, dweights) = primals, tangents
+    y = _product_by_groups(x, weights)
+    dy = jnp.zeros_like(y)
+    if not isinstance(dx, SymbolicZero):
+        dy += _product_by_groups(dx, weights)
+    if not isinstance(dweights, SymbolicZero):
+        groups = _groups(x.shape, weights.shape)
+        copies = jnp.broadcast_to(dweights, (groups, *weights.shape))
+        dy += (x.reshape(groups, -1, x.shape[-1]) @ copies).reshape(y.shape)
+    # Without the barrier XLA computes the output's gradient once for each of the two products that read it.
+    return y, jax.lax.optimization_barrier(dy)
+
+
+def _groups(x: tuple[int, ...], weights: tuple[int, int]) -> int:
+    """Chooses the most groups of B images that leave each at least 16 K F / (K + F) rows, or 1.
+
+    What their products write, K F numbers each, is then at most a sixteenth of what they read, K + F numbers a row.
+    """
+    inputs, outputs = weights
+    least = 16 * inputs * outputs / (inputs + outputs)
+    rows = math.prod(x[:-1])
+    return max(n for n in range(1, x[0] + 1) if n == 1 or (x[0] % n == 0 and rows >= n * least))
+
+
 def convolve_blocks(x: jax.Array, kernel: jax.Array, stride: int) -> jax.Array:
     """Computes `conv2d` with little traffic to memory and large matrix products.
 
@@ -72,9 +111,9 @@ def convolve_blocks(x: jax.Array, kernel: jax.Array, stride: int) -> jax.Array:
     places = [(i, j) for i in range(2) for j in range(2)]
     if step * step * channels < tile * tile * filters:
         neighbors = [blocks[:, i : i + rows, j : j + cols] for i, j in places]
-        y = _product(jnp.concatenate(neighbors, axis=-1), weights.reshape(-1, tile * tile * filters))
+        y = _product_by_groups(jnp.concatenate(neighbors, axis=-1), weights.reshape(-1, tile * tile * filters))
     else:
-        products = jnp.split(_product(blocks, jnp.concatenate(list(weights), axis=-1)), len(places), axis=-1)
+        products = jnp.split(_product_by_groups(blocks, jnp.concatenate(list(weights), axis=-1)), len(places), axis=-1)
         shifted = [z[:, i : i + rows, j : j + cols] for z, (i, j) in zip(products, places, strict=True)]
         y = functools.reduce(jnp.add, shifted)
 

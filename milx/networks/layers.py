@@ -92,12 +92,12 @@ shifted_relu.defvjp(_shifted_relu_forward, _shifted_relu_backward)
 
 
 def _sum_over_pixels(x: jax.Array, dtype: jnp.dtype) -> jax.Array:
-    """Sums [.., F] to [F]; on accelerators by a product with ones, since XLA's sum is slow for so few channels."""
-    flat = x.reshape(-1, x.shape[-1])
+    """Sums [B, .., F] to [F]; on accelerators first over B, since XLA is slow there where a sum leaves few channels."""
     if jax.default_backend() == "cpu":
-        return flat.sum(axis=0, dtype=dtype)
-    ones = jnp.ones((8, len(flat)), x.dtype)  # of a product with a single row XLA would make that sum again
-    return jnp.matmul(ones, flat, precision=jax.lax.Precision.HIGHEST, preferred_element_type=dtype)[0]
+        return x.reshape(-1, x.shape[-1]).sum(axis=0, dtype=dtype)
+    image = x.sum(axis=0, dtype=dtype)
+    image = jax.lax.optimization_barrier(image)  # without it XLA makes one sum of the two again
+    return image.reshape(-1, x.shape[-1]).sum(axis=0)
 
 
 class Conv(nn.Module):

@@ -70,3 +70,35 @@ def test_convolution_with_every_tasks_own_kernel_is_a_loop_of_lax(rng, convolve)
     found = jax.vmap(lambda x, kernel: convolve(x, kernel, 2))(x, kernel)
     expected = [reference_conv2d(x[i], kernel[i], 2) for i in range(5)]
     np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(("filters", "groups"), [(4, 4), (2, 8)])
+def test_kernels_gradients_by_groups_are_those_of_lax(rng, monkeypatch, filters, groups):
+    """Compares derivatives of both products of blocks, forward alone and reverse over reverse included."""
+    chosen, choose = [], convolution._groups
+    monkeypatch.setattr(convolution, "_groups", lambda *shapes: chosen.append(choose(*shapes)) or chosen[-1])
+    x, kernel, dx, dkernel = (
+        jnp.asarray(rng.standard_normal(shape)) for shape in 2 * ((8, 20, 24, 3), (3, 3, 3, filters))
+    )
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def all_derivatives(conv):
+        cubed = lambda x, kernel: jnp.sum(conv(x, kernel, 1) ** 3)  # noqa: E731
+        _, forward = jax.jvp(lambda *inputs: conv(*inputs, 1), (x, kernel), (dx, dkernel))
+        gradient, product = jax.jvp(jax.grad(cubed, (0, 1)), (x, kernel), (dx, dkernel))
+        reverse = jax.grad(lambda kernel: jnp.vdot(jax.grad(cubed, 1)(x, kernel), dkernel))(kernel)
+        return forward, gradient, product, reverse
+
+    found, expected = all_derivatives(convolution.convolve_blocks), all_derivatives(reference_conv2d)
+    assert set(chosen) == {groups}
+    for ours, theirs in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-10 * np.abs(theirs).max())
+
+
+def test_groups_write_at_most_a_sixteenth_of_what_they_read():
+    for x, weights in (((100, 17, 17, 256), (256, 256)), ((50, 17, 21, 160), (160, 160)), ((6, 5, 5, 7), (7, 3))):
+        groups = convolution._groups(x, weights)
+        read = np.prod(x[:-1]) * sum(weights)
+        larger = [n for n in range(groups + 1, x[0] + 1) if x[0] % n == 0]
+        assert x[0] % groups == 0 and 16 * groups * np.prod(weights) <= read
+        assert all(16 * n * np.prod(weights) > read for n in larger)

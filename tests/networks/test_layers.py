@@ -121,7 +121,7 @@ def test_residual_blocks_add_two_convolutions_to_their_input(rng):
 # Bias and center: derivatives of their own, which must be those that JAX finds.
 
 
-@pytest.mark.parametrize("by_product", [False, True])
+@pytest.mark.parametrize("on_gpu", [False, True])
 @pytest.mark.parametrize(
     ("written", "plain"),
     [
@@ -129,8 +129,8 @@ def test_residual_blocks_add_two_convolutions_to_their_input(rng):
         (lambda x, shift: layers.shifted_relu(x, shift, x.dtype), lambda x, shift: jax.nn.relu(x + shift)),
     ],
 )
-def test_derivatives_of_bias_and_center(rng, monkeypatch, by_product, written, plain):
-    if by_product:
+def test_derivatives_of_bias_and_center(rng, monkeypatch, on_gpu, written, plain):
+    if on_gpu:
         monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     inputs = jnp.asarray(rng.standard_normal((2, 3, 4, 5))), jnp.asarray(rng.standard_normal(5))
     tangent = jax.tree.map(lambda x: jnp.asarray(rng.standard_normal(x.shape)), inputs)
@@ -142,10 +142,10 @@ def test_derivatives_of_bias_and_center(rng, monkeypatch, by_product, written, p
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-12), derivatives(written), derivatives(plain))
 
 
-@pytest.mark.parametrize("by_product", [False, True])
-def test_gradients_of_bfloat16_images_are_summed_in_float32(monkeypatch, by_product):
+@pytest.mark.parametrize("on_gpu", [False, True])
+def test_gradients_of_bfloat16_images_are_summed_in_float32(monkeypatch, on_gpu):
     # 4,096 times 1/3: a sum in bfloat16 would stop growing at 256 times as much as one of its terms.
-    if by_product:
+    if on_gpu:
         monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     x, weight = jnp.ones((4096, 3)), 1 / 3
     expected = np.full(3, 4096 * float(jnp.bfloat16(weight)))
