@@ -238,6 +238,11 @@ _SAMPLING = {
 }
 _LADDER = _ladder()
 _SAMPLED = _LADDER["push-fast"].changes | _SAMPLING
+_MORE_TASKS = (
+    _SAMPLED
+    | _BEGINNING
+    | {"data.tasks": 2304, "data.demos_per_task": 4, "train.query_frames": 16, "train.steps": 20_000}
+)
 _EXPERTS = {
     "push-sampling-beginning": Row(
         "push: `fast`, by sampling, more of the beginning",
@@ -245,6 +250,16 @@ _EXPERTS = {
         _SAMPLED | {"train.frame_exponent": 2.0},
     ),
     "push-sampling": Row("push: `fast`, by sampling", "push", _SAMPLED),
+    "push-sampling-tasks": Row(
+        "push: `fast`, by sampling, 2,304 tasks of 4, 16 time steps of the query, Muon, 20,000 updates",
+        "push",
+        _MORE_TASKS,
+    ),
+    "push-sampling-chunks": Row(
+        "the same, the mean of actions that are predicted for four time steps at once",
+        "push",
+        _MORE_TASKS | {"method.chunk": 4, "method.execute": 0},
+    ),
 }
 
 TABLES: dict[str, dict[str, Row]] = {
