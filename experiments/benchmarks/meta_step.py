@@ -29,6 +29,7 @@ from milx.config.assemble import make_config
 from milx.config.schema import Config
 from milx.core import platform
 from milx.envs.base import Env
+from milx.methods.mil import MILConfig
 from milx.networks import layers
 from milx.networks.policy_network import PolicyConfig
 from milx.training.update import Loss, batch_gradient
@@ -46,6 +47,8 @@ def domain(name: str) -> tuple[Config, Env]:
         return push_sized.config(), push_sized.PushSized()
     config = make_config("reach", preset="paper")
     config.train.meta_batch = 5
+    assert isinstance(config.method, MILConfig)
+    config.method.imitation_steps = 0  # or the first steps, which are measured, would have no inner step
     return config, envs.make("reach")
 
 

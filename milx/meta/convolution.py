@@ -12,6 +12,9 @@ import jax
 import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 
+MANY_IMAGES = 16
+"""From so many images of a task on, sums go over groups of them. Presets draw at most eight time steps, or take all."""
+
 
 def same_padding(size: int, kernel: int, stride: int) -> tuple[int, int]:
     """Computes the zeros before and after an axis for ceil(size / stride) outputs (TensorFlow's SAME)."""
@@ -68,23 +71,28 @@ def _product_by_groups_jvp(primals: tuple, tangents: tuple) -> tuple[jax.Array, 
     dy = jnp.zeros_like(y)
     if not isinstance(dx, SymbolicZero):
         dy += _product_by_groups(dx, weights)
-    if not isinstance(dweights, SymbolicZero):
-        groups = _groups(x.shape, weights.shape)
-        copies = jnp.broadcast_to(dweights, (groups, *weights.shape))
-        dy += (x.reshape(groups, -1, x.shape[-1]) @ copies).reshape(y.shape)
+    if isinstance(dweights, SymbolicZero):
+        return y, dy
+    if (groups := _groups(x.shape, weights.shape)) == 1:
+        return y, dy + _product(x, dweights)
+    rows = x.reshape(groups, -1, x.shape[-1])
+    # The copies depend on x, so that `vmap` over tasks makes some for every task even where tasks share the weights.
+    copies = dweights * (1 + 0 * rows[:, :1, :1])
     # Without the barrier XLA computes the output's gradient once for each of the two products that read it.
-    return y, jax.lax.optimization_barrier(dy)
+    return y, jax.lax.optimization_barrier(dy + (rows @ copies).reshape(y.shape))
 
 
 def _groups(x: tuple[int, ...], weights: tuple[int, int]) -> int:
-    """Chooses the most groups of B images that leave each at least 16 K F / (K + F) rows, or 1.
+    """Chooses the most groups of B images that leave each at least 16 K F / (K + F) rows; one group of few images.
 
     What their products write, K F numbers each, is then at most a sixteenth of what they read, K + F numbers a row.
+    Batches of few images of a task have many tasks, which keep a GPU busy without groups.
     """
     inputs, outputs = weights
     least = 16 * inputs * outputs / (inputs + outputs)
     rows = math.prod(x[:-1])
-    return max(n for n in range(1, x[0] + 1) if n == 1 or (x[0] % n == 0 and rows >= n * least))
+    most = x[0] if x[0] >= MANY_IMAGES else 1
+    return max(n for n in range(1, most + 1) if n == 1 or (x[0] % n == 0 and rows >= n * least))
 
 
 def convolve_blocks(x: jax.Array, kernel: jax.Array, stride: int) -> jax.Array:

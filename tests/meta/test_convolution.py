@@ -78,7 +78,7 @@ def test_kernels_gradients_by_groups_are_those_of_lax(rng, monkeypatch, filters,
     chosen, choose = [], convolution._groups
     monkeypatch.setattr(convolution, "_groups", lambda *shapes: chosen.append(choose(*shapes)) or chosen[-1])
     x, kernel, dx, dkernel = (
-        jnp.asarray(rng.standard_normal(shape)) for shape in 2 * ((8, 20, 24, 3), (3, 3, 3, filters))
+        jnp.asarray(rng.standard_normal(shape)) for shape in 2 * ((16, 14, 17, 3), (3, 3, 3, filters))
     )
 
     @functools.partial(jax.jit, static_argnums=0)
@@ -95,10 +95,23 @@ def test_kernels_gradients_by_groups_are_those_of_lax(rng, monkeypatch, filters,
         np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-10 * np.abs(theirs).max())
 
 
+def test_gradient_of_a_kernel_that_tasks_share_is_the_sum_over_tasks(rng):
+    x, kernel = jnp.asarray(rng.standard_normal((3, 16, 14, 17, 3))), jnp.asarray(rng.standard_normal((3, 3, 3, 4)))
+
+    def gradient(conv):
+        return jax.grad(lambda kernel: jnp.sum(jax.vmap(lambda x: conv(x, kernel, 1))(x) ** 3))(kernel)
+
+    expected = gradient(reference_conv2d)
+    np.testing.assert_allclose(
+        gradient(convolution.convolve_blocks), expected, rtol=0, atol=1e-10 * np.abs(expected).max()
+    )
+
+
 def test_groups_write_at_most_a_sixteenth_of_what_they_read():
-    for x, weights in (((100, 17, 17, 256), (256, 256)), ((50, 17, 21, 160), (160, 160)), ((6, 5, 5, 7), (7, 3))):
+    for x, weights in (((100, 17, 17, 256), (256, 256)), ((50, 17, 21, 160), (160, 160)), ((18, 5, 5, 7), (7, 3))):
         groups = convolution._groups(x, weights)
         read = np.prod(x[:-1]) * sum(weights)
         larger = [n for n in range(groups + 1, x[0] + 1) if x[0] % n == 0]
-        assert x[0] % groups == 0 and 16 * groups * np.prod(weights) <= read
+        assert groups > 1 and x[0] % groups == 0 and 16 * groups * np.prod(weights) <= read
         assert all(16 * n * np.prod(weights) > read for n in larger)
+    assert convolution._groups((8, 17, 17, 256), (256, 256)) == 1
