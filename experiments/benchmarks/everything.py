@@ -26,7 +26,7 @@ from milx.evaluation import provenance
 
 ON_CPUS = ("meta_step", "few_shot", "physics", "render", "latency", "deploy", "main_command")
 """The scripts that a CPU runs, too."""
-BENCHMARKS = (*ON_CPUS, "meshes", "planning", "growth", "scaling", "compiling")
+BENCHMARKS = (*ON_CPUS, "convolutions", "meshes", "planning", "growth", "scaling", "compiling")
 """The scripts."""
 HERE = pathlib.Path(__file__).parent
 RESULTS = HERE.parent / "results" / "benchmarks"

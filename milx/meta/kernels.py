@@ -1,0 +1,246 @@
+"""Convolutions of tasks, each with a kernel of its own, as kernels of a GPU: the value and both of its transposes.
+
+With stride s, and a rows and a' columns of zeros before the image (TensorFlow's SAME), all three are sums over
+
+    y[t, b, p, q, f] = sum over i, j, c of x[t, b, s p + i - a, s q + j - a', c] W[t, i, j, c, f],
+
+which is linear in x and in W. Each program multiplies matrices: what lies under row i of the window of many outputs,
+where j and c are next to each other in memory, by row i of the kernel. So images are read from the caches of the GPU
+as often as windows overlap, and from its memory hardly more than once; nothing is copied, padded or transposed.
+
+Products are summed in float32, or in float64 where the numbers are. Numbers of 32 bits are multiplied as the GPU does
+by default, which is TF32.
+"""
+
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.experimental import pallas as pl
+from jax.experimental.pallas import triton
+
+from milx.meta.convolution import same_padding
+
+_PIXELS = 128
+"""Outputs of a program."""
+_PIXELS_AT_ONCE = 64
+"""Outputs in a step of a program that sums over them."""
+_PROGRAMS = 528
+"""At least as many sum for the gradient of all kernels, four for each multiprocessor of an H100 or H200."""
+_LEAST, _WIDEST = 16, 256
+"""Least side of matrices that are multiplied at once, and most bytes in a row of the left one."""
+_WARPS = 4
+
+
+def convolve(x: jax.Array, kernel: jax.Array, *, stride: int, interpret: bool = False) -> jax.Array:
+    """Computes y, [T, B, P, Q, F], of x, [T, B, H, W, C], and W, [T, k, k, C, F], or [1, k, k, C, F] for all tasks."""
+    tasks, images, *size, channels = x.shape
+    shared, taps, _, _, filters = kernel.shape
+    shape = tuple(-(-length // stride) for length in size)
+    before = [same_padding(length, taps, stride)[0] for length in size]
+    count, columns = images * shape[0] * shape[1], _power_of_two(filters)
+
+    def program(x, kernel, y):
+        task, pixel = pl.program_id(1), _numbers(_PIXELS) + pl.program_id(0) * _PIXELS
+        image, top, left = _place(pixel, shape)
+        window = image, top * stride - before[0], left * stride - before[1]
+        f, valid = _numbers(columns), pixel < count
+
+        def add(row, total):
+            for piece in _pieces(taps * channels, x.dtype):
+                under = _under(x, task, size, channels, window, row, piece, taps, valid)
+                r = _numbers(piece[1]) + piece[0]
+                mask = (r < taps * channels)[:, None] & (f < filters)[None]
+                weights = _load(kernel.at[task if shared > 1 else 0, row, r[:, None], f[None]], mask)
+                total += _product(under, weights)
+            return total
+
+        total = lax.fori_loop(0, taps, add, jnp.zeros((_PIXELS, columns), _wide(y.dtype)))
+        _store(y.at[task, pixel[:, None], f[None]], total, valid[:, None] & (f < filters)[None])
+
+    y = _call(program, (tasks, count, filters), x.dtype, (pl.cdiv(count, _PIXELS), tasks), "convolve", interpret)(
+        x.reshape(tasks, -1), kernel.reshape(shared, taps, taps * channels, filters)
+    )
+    return y.reshape(tasks, images, *shape, filters)
+
+
+def to_input(
+    dy: jax.Array, kernel: jax.Array, *, stride: int, size: tuple[int, int], interpret: bool = False
+) -> jax.Array:
+    """Computes the transpose in x, [T, B, H, W, C], of dy, [T, B, P, Q, F], by W, [T, k, k, C, F] or [1, ...].
+
+    Pixels whose row and column leave the same remainders by s meet the same rows and columns of the kernel, every s-th
+    of them, in reverse. So each of the s² kinds of pixels is what a convolution with a smaller kernel gives.
+    """
+    tasks, images, *shape, filters = dy.shape
+    shared, taps, _, channels, _ = kernel.shape
+    fewer = pl.cdiv(taps, stride)
+    before = [same_padding(length, taps, stride)[0] for length in size]
+    kernel = jnp.pad(kernel, ((0, 0), *[(0, fewer * stride - taps)] * 2, (0, 0), (0, 0)))
+    kernel = kernel.reshape(shared, fewer, stride, fewer, stride, channels, filters)[:, ::-1, :, ::-1]
+    kernel = kernel.transpose(0, 2, 4, 1, 3, 6, 5).reshape(shared, stride, stride, fewer, fewer * filters, channels)
+    coarse = tuple(-(-length // stride) for length in size)
+    count, columns = images * coarse[0] * coarse[1], _power_of_two(channels)
+
+    def program(dy, kernel, dx):
+        task, pixel = pl.program_id(1), _numbers(_PIXELS) + pl.program_id(0) * _PIXELS
+        image, top, left = _place(pixel, coarse)
+        c = _numbers(columns)
+        for kind in ((row, column) for row in range(stride) for column in range(stride)):
+            y, x = top * stride + kind[0], left * stride + kind[1]
+            valid = (pixel < count) & (y < size[0]) & (x < size[1])
+            (down, i), (right, j) = (divmod(offset + pad, stride) for offset, pad in zip(kind, before, strict=True))
+            window = image, top + down - (fewer - 1), left + right - (fewer - 1)
+
+            def add(row, total, i=i, j=j, window=window, valid=valid):
+                for piece in _pieces(fewer * filters, dy.dtype):
+                    under = _under(dy, task, shape, filters, window, row, piece, fewer, valid)
+                    r = _numbers(piece[1]) + piece[0]
+                    mask = (r < fewer * filters)[:, None] & (c < channels)[None]
+                    weights = _load(kernel.at[task if shared > 1 else 0, i, j, row, r[:, None], c[None]], mask)
+                    total += _product(under, weights)
+                return total
+
+            rows = pl.cdiv(taps - i, stride)  # those before them are zero
+            total = lax.fori_loop(fewer - rows, fewer, add, jnp.zeros((_PIXELS, columns), _wide(dx.dtype)))
+            at = ((image * size[0] + y) * size[1] + x) * channels
+            _store(dx.at[task, at[:, None] + c[None]], total, valid[:, None] & (c < channels)[None])
+
+    numbers = images * size[0] * size[1] * channels
+    dx = _call(program, (tasks, numbers), dy.dtype, (pl.cdiv(count, _PIXELS), tasks), "to_input", interpret)(
+        dy.reshape(tasks, -1), kernel
+    )
+    return dx.reshape(tasks, images, *size, channels)
+
+
+def to_kernel(x: jax.Array, dy: jax.Array, *, stride: int, taps: int, interpret: bool = False) -> jax.Array:
+    """Computes the transpose in W, [T, k, k, C, F], of dy, [T, B, P, Q, F], by x, [T, B, H, W, C]; k are the taps.
+
+    Several programs sum over some of the outputs each, for a row of the kernel, and their sums are added.
+    """
+    tasks, images, *size, channels = x.shape
+    *shape, filters = dy.shape[2:]
+    before = [same_padding(length, taps, stride)[0] for length in size]
+    count, columns, pieces = (
+        images * shape[0] * shape[1],
+        _power_of_two(filters),
+        list(_pieces(taps * channels, x.dtype)),
+    )
+    steps = pl.cdiv(count, _PIXELS_AT_ONCE)
+    groups = min(steps, pl.cdiv(_PROGRAMS, tasks * taps))
+    steps = pl.cdiv(steps, groups)
+
+    def program(x, dy, dkernel):
+        row, group, task = (pl.program_id(axis) for axis in range(3))
+        f = _numbers(columns)
+
+        def add(step, totals):
+            pixel = _numbers(_PIXELS_AT_ONCE) + (group * steps + step) * _PIXELS_AT_ONCE
+            image, top, left = _place(pixel, shape)
+            window, valid = (image, top * stride - before[0], left * stride - before[1]), pixel < count
+            given = _load(dy.at[task, pixel[:, None], f[None]], valid[:, None] & (f < filters)[None])
+            under = [_under(x, task, size, channels, window, row, piece, taps, valid) for piece in pieces]
+            return tuple(total + _product(left, given, 0) for total, left in zip(totals, under, strict=True))
+
+        start = tuple(jnp.zeros((width, columns), _wide(x.dtype)) for _, width in pieces)
+        for (first, width), total in zip(pieces, lax.fori_loop(0, steps, add, start), strict=True):
+            r = _numbers(width) + first
+            mask = (r < taps * channels)[:, None] & (f < filters)[None]
+            _store(dkernel.at[group, task, row, r[:, None], f[None]], total, mask)
+
+    sums = groups, tasks, taps, taps * channels, filters
+    parts = _call(program, sums, _wide(x.dtype), (taps, groups, tasks), "to_kernel", interpret)(
+        x.reshape(tasks, -1), dy.reshape(tasks, count, filters)
+    )
+    return parts.sum(axis=0).astype(x.dtype).reshape(tasks, taps, taps, channels, filters)
+
+
+def _under(
+    images: Any,
+    task: jax.Array,
+    size: list[int],
+    channels: int,
+    window: tuple[jax.Array, jax.Array, jax.Array],
+    row: Any,
+    piece: tuple[int, int],
+    taps: int,
+    valid: jax.Array,
+) -> jax.Array:
+    """Loads a piece of what lies under a row of windows: [M, its width], zeros outside the image and the window.
+
+    Args:
+        images: a reference to [T, B H W C] numbers.
+        task: which of the T.
+        size: H and W.
+        channels: C.
+        window: [M] images, and the rows and columns of the windows' first pixels, which may be outside the image.
+        row: the row of the window.
+        piece: first and number of the k C numbers under a row.
+        taps: k.
+        valid: [M] bool, whether there is such a window.
+    """
+    number, top, left = window
+    r = _numbers(piece[1]) + piece[0]
+    column = left[:, None] + lax.div(r, jnp.int32(channels))[None]
+    inside = (column >= 0) & (column < size[1]) & (r < taps * channels)[None]
+    inside &= (valid & (top + row >= 0) & (top + row < size[0]))[:, None]
+    first = ((number * size[0] + top + row) * size[1] + left) * channels
+    return _load(images.at[task, first[:, None] + r[None]], inside)
+
+
+def _pieces(length: int, dtype: Any) -> Iterator[tuple[int, int]]:
+    """Cuts `length` numbers of a type into pieces whose widths are powers of two: first and width of each."""
+    first = 0
+    while first < length:
+        rest = length - first
+        width = min(_power_of_two(rest), _WIDEST // jnp.dtype(dtype).itemsize)
+        if width > max(1.25 * rest, 2 * _LEAST):
+            width //= 2
+        yield first, width
+        first += width
+
+
+def _place(pixel: jax.Array, shape: tuple[int, ...] | list[int]) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Finds image, row and column of each of B P Q pixels; the quotients of positive numbers need no rounding."""
+    line = lax.div(pixel, jnp.int32(shape[1]))
+    image = lax.div(line, jnp.int32(shape[0]))
+    return image, line - image * shape[0], pixel - line * shape[1]
+
+
+def _power_of_two(length: int) -> int:
+    return max(_LEAST, pl.next_power_of_2(length))
+
+
+def _numbers(count: int) -> jax.Array:
+    return jnp.arange(count, dtype=jnp.int32)
+
+
+def _wide(dtype: Any) -> Any:
+    return jnp.promote_types(dtype, jnp.float32)
+
+
+def _product(a: jax.Array, b: jax.Array, contract: int = 1) -> jax.Array:
+    """Multiplies [M, K], or [K, M] if its axis 0 is contracted, by [K, N]."""
+    axes = (((contract,), (0,)), ((), ()))
+    return lax.dot_general(a, b, axes, preferred_element_type=_wide(a.dtype))
+
+
+def _load(reference: Any, mask: jax.Array) -> jax.Array:
+    return triton.load(reference, mask=mask, other=0)
+
+
+def _store(reference: Any, value: jax.Array, mask: jax.Array) -> None:
+    triton.store(reference, value.astype(reference.dtype), mask=mask)
+
+
+def _call(program: Any, shape: tuple[int, ...], dtype: Any, grid: tuple[int, ...], name: str, interpret: bool) -> Any:
+    return pl.pallas_call(
+        program,
+        out_shape=jax.ShapeDtypeStruct(shape, dtype),
+        grid=grid,
+        compiler_params=triton.CompilerParams(num_warps=_WARPS, num_stages=3),
+        interpret=interpret,
+        name=name,
+    )
