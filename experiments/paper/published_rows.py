@@ -251,12 +251,12 @@ _EXPERTS = {
     ),
     "push-sampling": Row("push: `fast`, by sampling", "push", _SAMPLED),
     "push-sampling-tasks": Row(
-        "push: `fast`, by sampling, 2,304 tasks of 4, 16 time steps of the query, Muon, 20,000 updates",
+        "push: the first row, but four demonstrations of 2,304 tasks, 16 query time steps, Muon, 20,000 updates",
         "push",
         _MORE_TASKS,
     ),
     "push-sampling-chunks": Row(
-        "the same, the mean of actions that are predicted for four time steps at once",
+        "push: the second row, but with chunks of four actions, of which the mean is executed",
         "push",
         _MORE_TASKS | {"method.chunk": 4, "method.execute": 0},
     ),

@@ -13,7 +13,10 @@ import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 
 MANY_IMAGES = 16
-"""From so many images of a task on, sums go over groups of them. Presets draw at most eight time steps, or take all."""
+"""With so many images of a task or more, sums over images are split or done first.
+
+Presets draw at most eight time steps of a demonstration, or take all; in between the number has not been tuned.
+"""
 
 
 def same_padding(size: int, kernel: int, stride: int) -> tuple[int, int]:
@@ -76,7 +79,8 @@ def _product_by_groups_jvp(primals: tuple, tangents: tuple) -> tuple[jax.Array, 
     if (groups := _groups(x.shape, weights.shape)) == 1:
         return y, dy + _product(x, dweights)
     rows = x.reshape(groups, -1, x.shape[-1])
-    # The copies depend on x, so that `vmap` over tasks makes some for every task even where tasks share the weights.
+    # The copies depend on x, so that `vmap` over tasks makes some for every task even where tasks share the weights:
+    # otherwise XLA reorders x, to multiply the same group of all tasks at once.
     copies = dweights * (1 + 0 * rows[:, :1, :1])
     # Without the barrier XLA computes the output's gradient once for each of the two products that read it.
     return y, jax.lax.optimization_barrier(dy + (rows @ copies).reshape(y.shape))

@@ -6,13 +6,15 @@ With stride s, and a rows and a' columns of zeros before the image (TensorFlow's
 
 which is linear in x and in W. Each program multiplies matrices: what lies under row i of the window of many outputs,
 where j and c are next to each other in memory, by row i of the kernel. So images are read from the caches of the GPU
-as often as windows overlap, and from its memory hardly more than once; nothing is copied, padded or transposed.
+as often as windows overlap, and windows are not copied.
 
-Products are summed in float32, or in float64 where the numbers are. Numbers of 32 bits are multiplied as the GPU does
-by default, which is TF32.
+All raise a ValueError for more than `MOST_COLUMNS` filters or `MOST_NUMBERS` numbers in an array, those of all tasks
+together. Products are summed in float32, or in float64 where the numbers are. Numbers of 32 bits are multiplied as the
+GPU does by default, which is TF32.
 """
 
-from collections.abc import Iterator
+import math
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
@@ -28,10 +30,16 @@ _PIXELS = 128
 _PIXELS_AT_ONCE = 64
 """Outputs in a step of a program that sums over them."""
 _PROGRAMS = 528
-"""At least as many sum for the gradient of all kernels, four for each multiprocessor of an H100 or H200."""
-_LEAST, _WIDEST = 16, 256
-"""Least side of matrices that are multiplied at once, and most bytes in a row of the left one."""
+"""Programs that `to_kernel` starts if there are enough outputs: four for each multiprocessor of an H100 or H200."""
+_LEAST = 16
+"""Least side of the matrices that are multiplied."""
+_BYTES = 256
+"""Most bytes in a row of the left matrix."""
 _WARPS = 4
+MOST_COLUMNS = 128
+"""Most filters, and most channels of images that need a gradient: a program sums as many numbers for each output."""
+MOST_NUMBERS = 2**31 - 2**16
+"""Most numbers in an array, so that 32 bits count them, and the outputs that the last programs have beyond its end."""
 
 
 def convolve(x: jax.Array, kernel: jax.Array, *, stride: int, interpret: bool = False) -> jax.Array:
@@ -40,7 +48,8 @@ def convolve(x: jax.Array, kernel: jax.Array, *, stride: int, interpret: bool = 
     shared, taps, _, _, filters = kernel.shape
     shape = tuple(-(-length // stride) for length in size)
     before = [same_padding(length, taps, stride)[0] for length in size]
-    count, columns = images * shape[0] * shape[1], _power_of_two(filters)
+    count = images * shape[0] * shape[1]
+    columns = _columns(filters)
 
     def program(x, kernel, y):
         task, pixel = pl.program_id(1), _numbers(_PIXELS) + pl.program_id(0) * _PIXELS
@@ -69,7 +78,7 @@ def convolve(x: jax.Array, kernel: jax.Array, *, stride: int, interpret: bool = 
 def to_input(
     dy: jax.Array, kernel: jax.Array, *, stride: int, size: tuple[int, int], interpret: bool = False
 ) -> jax.Array:
-    """Computes the transpose in x, [T, B, H, W, C], of dy, [T, B, P, Q, F], by W, [T, k, k, C, F] or [1, ...].
+    """Computes the transpose in x, [T, B, H, W, C], of dy, [T, B, P, Q, F], by W, [T, k, k, C, F] or [1, k, k, C, F].
 
     Pixels whose row and column leave the same remainders by s meet the same rows and columns of the kernel, every s-th
     of them, in reverse. So each of the s² kinds of pixels is what a convolution with a smaller kernel gives.
@@ -82,7 +91,8 @@ def to_input(
     kernel = kernel.reshape(shared, fewer, stride, fewer, stride, channels, filters)[:, ::-1, :, ::-1]
     kernel = kernel.transpose(0, 2, 4, 1, 3, 6, 5).reshape(shared, stride, stride, fewer, fewer * filters, channels)
     coarse = tuple(-(-length // stride) for length in size)
-    count, columns = images * coarse[0] * coarse[1], _power_of_two(channels)
+    count = images * coarse[0] * coarse[1]
+    columns = _columns(channels)
 
     def program(dy, kernel, dx):
         task, pixel = pl.program_id(1), _numbers(_PIXELS) + pl.program_id(0) * _PIXELS
@@ -103,7 +113,7 @@ def to_input(
                     total += _product(under, weights)
                 return total
 
-            rows = pl.cdiv(taps - i, stride)  # those before them are zero
+            rows = pl.cdiv(taps - i, stride)  # of the kernel; the rows before them are of its padding
             total = lax.fori_loop(fewer - rows, fewer, add, jnp.zeros((_PIXELS, columns), _wide(dx.dtype)))
             at = ((image * size[0] + y) * size[1] + x) * channels
             _store(dx.at[task, at[:, None] + c[None]], total, valid[:, None] & (c < channels)[None])
@@ -123,11 +133,9 @@ def to_kernel(x: jax.Array, dy: jax.Array, *, stride: int, taps: int, interpret:
     tasks, images, *size, channels = x.shape
     *shape, filters = dy.shape[2:]
     before = [same_padding(length, taps, stride)[0] for length in size]
-    count, columns, pieces = (
-        images * shape[0] * shape[1],
-        _power_of_two(filters),
-        list(_pieces(taps * channels, x.dtype)),
-    )
+    pieces = list(_pieces(taps * channels, x.dtype))
+    count = images * shape[0] * shape[1]
+    columns = _columns(filters)
     steps = pl.cdiv(count, _PIXELS_AT_ONCE)
     groups = min(steps, pl.cdiv(_PROGRAMS, tasks * taps))
     steps = pl.cdiv(steps, groups)
@@ -191,11 +199,14 @@ def _under(
 
 
 def _pieces(length: int, dtype: Any) -> Iterator[tuple[int, int]]:
-    """Cuts `length` numbers of a type into pieces whose widths are powers of two: first and width of each."""
+    """Cuts `length` numbers of a type into pieces: first and width of each.
+
+    Widths are powers of two, so the last piece may reach beyond the end.
+    """
     first = 0
     while first < length:
         rest = length - first
-        width = min(_power_of_two(rest), _WIDEST // jnp.dtype(dtype).itemsize)
+        width = min(_power_of_two(rest), _BYTES // jnp.dtype(dtype).itemsize)
         if width > max(1.25 * rest, 2 * _LEAST):
             width //= 2
         yield first, width
@@ -207,6 +218,12 @@ def _place(pixel: jax.Array, shape: tuple[int, ...] | list[int]) -> tuple[jax.Ar
     line = lax.div(pixel, jnp.int32(shape[1]))
     image = lax.div(line, jnp.int32(shape[0]))
     return image, line - image * shape[0], pixel - line * shape[1]
+
+
+def _columns(numbers: int) -> int:
+    if numbers > MOST_COLUMNS:
+        raise ValueError(f"filters or channels: got {numbers}, expected at most {MOST_COLUMNS}")
+    return _power_of_two(numbers)
 
 
 def _power_of_two(length: int) -> int:
@@ -235,8 +252,11 @@ def _store(reference: Any, value: jax.Array, mask: jax.Array) -> None:
     triton.store(reference, value.astype(reference.dtype), mask=mask)
 
 
-def _call(program: Any, shape: tuple[int, ...], dtype: Any, grid: tuple[int, ...], name: str, interpret: bool) -> Any:
-    return pl.pallas_call(
+def _call(
+    program: Any, shape: tuple[int, ...], dtype: Any, grid: tuple[int, ...], name: str, interpret: bool
+) -> Callable[..., jax.Array]:
+    """Returns a function of arrays that runs the program on a grid."""
+    call = pl.pallas_call(
         program,
         out_shape=jax.ShapeDtypeStruct(shape, dtype),
         grid=grid,
@@ -244,3 +264,11 @@ def _call(program: Any, shape: tuple[int, ...], dtype: Any, grid: tuple[int, ...
         interpret=interpret,
         name=name,
     )
+
+    def run(*arrays: jax.Array) -> jax.Array:
+        for numbers in (math.prod(shape), *(array.size for array in arrays)):
+            if numbers > MOST_NUMBERS:
+                raise ValueError(f"{name}: got an array of {numbers} numbers, expected at most {MOST_NUMBERS}")
+        return call(*arrays)
+
+    return run

@@ -5,7 +5,7 @@ Kernels that all tasks share have a leading axis of 1.
 """
 
 import functools
-import math
+import inspect
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -30,23 +30,21 @@ def convolve_directly(x: jax.Array, kernel: jax.Array, stride: int, interpret: b
         [B, ceil(H / stride), ceil(W / stride), F].
 
     Raises:
-        ValueError: if images or outputs have 2³¹ numbers or more, which the kernels cannot count.
+        ValueError: for more than 128 filters, or channels where images need a gradient, and for arrays of so many
+            numbers, all tasks together, that 32 bits do not count them.
     """
-    outputs = x.shape[0] * math.prod(-(-length // stride) for length in x.shape[1:3]) * kernel.shape[-1]
-    for name, numbers in (("x", math.prod(x.shape[:3]) * max(x.shape[3], 4)), ("outputs", outputs)):
-        if numbers >= 2**31:
-            raise ValueError(
-                f"{name}: got {numbers} numbers, expected fewer than {2**31}: convolve fewer images at once"
-            )
+    dtype = jnp.result_type(x, kernel)
+    x, kernel = x.astype(dtype), kernel.astype(dtype)
     if x.shape[-1] == 3:  # a pixel of four numbers is read at once
         x, kernel = jnp.pad(x, [(0, 0)] * 3 + [(0, 1)]), jnp.pad(kernel, [(0, 0)] * 2 + [(0, 1), (0, 0)])
     return _convolve.bind(x[None], kernel[None], stride=stride, interpret=interpret)[0]
 
 
 def _primitive(function: Callable[..., jax.Array]) -> Primitive:
-    """Makes an operation of a function of two arrays and static settings."""
+    """Makes an operation of a function of two arrays and static settings, which are its keywords."""
     primitive = Primitive(function.__name__)
-    primitive.def_impl(lambda *args, **settings: jax.jit(functools.partial(function, **settings))(*args))
+    settings = [each.name for each in inspect.signature(function).parameters.values() if each.kind == each.KEYWORD_ONLY]
+    primitive.def_impl(jax.jit(function, static_argnames=settings))
     primitive.def_abstract_eval(lambda *args, **settings: _shaped(function, args, settings))
     mlir.register_lowering(primitive, mlir.lower_fun(function, multiple_results=False))
     return primitive

@@ -92,7 +92,11 @@ shifted_relu.defvjp(_shifted_relu_forward, _shifted_relu_backward)
 
 
 def _sum_over_pixels(x: jax.Array, dtype: jnp.dtype) -> jax.Array:
-    """Sums [B, .., F] to [F]; on accelerators in a way that XLA is not slow at where so few channels remain."""
+    """Sums [B, .., F] to [F].
+
+    XLA's sum is slow on accelerators where few channels remain, so many images are summed over images first, and few
+    are multiplied by ones.
+    """
     flat = x.reshape(-1, x.shape[-1])
     if jax.default_backend() == "cpu":
         return flat.sum(axis=0, dtype=dtype)

@@ -107,6 +107,19 @@ def test_gradient_of_a_kernel_that_tasks_share_is_the_sum_over_tasks(rng):
     )
 
 
+def test_kernels_gradients_by_groups_are_as_exact_as_their_products(rng):
+    """Bounds the error of a sum of eight groups' products: they, the sum, and what they are made of have 8 bits."""
+    x, kernel = (jnp.asarray(rng.standard_normal(shape)) for shape in ((16, 14, 17, 3), (3, 3, 3, 2)))
+    x, kernel = (value.astype(jnp.bfloat16).astype(float) for value in (x, kernel))
+
+    def gradient(x, kernel):
+        return jax.grad(lambda kernel: jnp.sum(convolution.convolve_blocks(x, kernel, 1)))(kernel).astype(float)
+
+    exact, rough = gradient(x, kernel), gradient(x.astype(jnp.bfloat16), kernel.astype(jnp.bfloat16))
+    distance = jnp.linalg.norm(rough - exact) / jnp.linalg.norm(exact)
+    assert 1e-4 < distance < 2**-7
+
+
 def test_groups_write_at_most_a_sixteenth_of_what_they_read():
     for x, weights in (((100, 17, 17, 256), (256, 256)), ((50, 17, 21, 160), (160, 160)), ((18, 5, 5, 7), (7, 3))):
         groups = convolution._groups(x, weights)

@@ -7,11 +7,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from milx.meta import kernels
 from milx.meta.task_convolution import convolve_directly
 
-# Images, height, width, channels, filters, kernel, stride: an image of three channels, one whose windows are cut into
-# pieces of 64 and 16 numbers, and one with fewer numbers in a row of the kernel than are multiplied at once.
-SHAPES = [(2, 9, 11, 3, 5, 5, 2), (1, 6, 7, 16, 4, 5, 3), (2, 5, 6, 4, 3, 3, 1)]
+# Images, height, width, channels, filters, kernel and stride.
+SHAPES = {
+    "three channels": (2, 9, 11, 3, 5, 5, 2),
+    "rows of several pieces": (1, 6, 7, 16, 4, 5, 3),
+    "several programs": (2, 14, 15, 4, 3, 3, 1),
+    "a single pixel": (2, 5, 4, 4, 3, 1, 1),
+    "pixels that no window covers": (2, 7, 8, 2, 3, 2, 3),
+}
 
 
 def directly(x, kernel, stride):
@@ -43,36 +49,55 @@ def derivatives(conv, inputs, directions, stride):
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_value_and_derivatives_are_those_of_lax(rng, shape):
-    images, height, width, channels, filters, taps, stride = shape
+def test_value_and_derivatives_are_those_of_lax(rng, monkeypatch, shape):
+    images, height, width, channels, filters, taps, stride = SHAPES[shape]
+    monkeypatch.setattr(kernels, "_PROGRAMS", 2 * taps)  # two of them sum, in several steps if there are 420 outputs
     sizes = ((images, height, width, channels), (taps, taps, channels, filters))
     inputs, directions = (tuple(jnp.asarray(rng.standard_normal(size)) for size in sizes) for _ in range(2))
     agree(derivatives(directly, inputs, directions, stride), derivatives(reference, inputs, directions, stride))
 
 
-@pytest.mark.parametrize("of_tasks", ["images and kernels", "images", "kernels", "images twice"])
-def test_gradients_of_mapped_convolutions_are_those_of_lax(rng, of_tasks):
-    """Maps images, kernels or both over tasks; what tasks share has the sum of their gradients."""
-    x, kernel = (jnp.asarray(rng.standard_normal(size)) for size in ((3, 2, 5, 6, 4), (3, 3, 3, 4, 3)))
-    axes = {"images and kernels": (0, 0), "images": (0, None), "kernels": (None, 0), "images twice": (0, None)}[
-        of_tasks
-    ]
-    x, kernel = (value if axis == 0 else value[0] for value, axis in zip((x, kernel), axes, strict=True))
-    if of_tasks == "images twice":
-        x = jnp.stack([x, 2 * x])
+@pytest.mark.parametrize(
+    "axes", [[(0, 0)], [(0, None)], [(None, 0)], [(3, 1)], [(0, None), (0, None)], [(None, 0), (0, None)]]
+)
+def test_gradients_of_mapped_convolutions_are_those_of_lax(rng, axes):
+    """Maps images, kernels or both over tasks, once or twice; what tasks share has the sum of their gradients."""
+    shapes = [[2, 5, 6, 4], [3, 3, 4, 3]]
+    for pair in axes:
+        for shape, axis in zip(shapes, pair, strict=True):
+            if axis is not None:
+                shape.insert(axis, 2)
+    inputs = tuple(jnp.asarray(rng.standard_normal(shape)) for shape in shapes)
 
     def gradient(conv):
-        mapped = jax.vmap(lambda x, kernel: conv(x, kernel, 2), axes)
-        mapped = jax.vmap(mapped, (0, None)) if of_tasks == "images twice" else mapped
-        return jax.jit(jax.grad(lambda inputs: jnp.sum(mapped(*inputs) ** 3)))((x, kernel))
+        mapped = lambda x, kernel: conv(x, kernel, 2)  # noqa: E731
+        for pair in axes:
+            mapped = jax.vmap(mapped, pair)
+        return jax.jit(jax.grad(lambda inputs: jnp.sum(mapped(*inputs) ** 3)))(inputs)
 
     agree(gradient(directly), gradient(reference))
 
 
-@pytest.mark.parametrize(("filters", "message"), [(1, "x: got 3221225472 "), (4096, "outputs: got 4294967296 ")])
-def test_more_numbers_than_the_kernels_count_are_refused(filters, message):
-    images = 2**20 if filters > 1 else 3 * 2**20
-    x = jax.ShapeDtypeStruct((images, 2, 2, 4 if filters > 1 else 256), jnp.float32)
-    kernel = jax.ShapeDtypeStruct((3, 3, x.shape[-1], filters), jnp.float32)
+def test_products_of_bfloat16_are_summed_in_float32(rng):
+    """Compares the gradient of a kernel, a sum over 1,200 pixels, with float64, from the same rounded numbers."""
+    x, kernel = (jnp.asarray(rng.random(shape)).astype(jnp.bfloat16) for shape in ((3, 20, 20, 4), (3, 3, 4, 5)))
+
+    def gradient(conv, x, kernel):
+        return jax.jit(jax.grad(lambda kernel: conv(x, kernel, 1).sum()))(kernel)
+
+    expected = gradient(reference, x.astype(float), kernel.astype(float))
+    np.testing.assert_allclose(gradient(directly, x, kernel).astype(float), expected, rtol=2**-8)
+
+
+@pytest.mark.parametrize(
+    ("tasks", "channels", "filters", "message"),
+    [
+        (2**14, 8, 8, "convolve: got an array of 4294967296 numbers, expected at most 2147418112"),
+        (1, 4, 129, "filters or channels: got 129, expected at most 128"),
+    ],
+)
+def test_sizes_that_the_kernels_cannot_have_are_refused(tasks, channels, filters, message):
+    x = jax.ShapeDtypeStruct((tasks, 2, 128, 128, channels), jnp.float32)
+    kernel = jax.ShapeDtypeStruct((3, 3, channels, filters), jnp.float32)
     with pytest.raises(ValueError, match=message):
-        jax.eval_shape(lambda x, kernel: convolve_directly(x, kernel, 2), x, kernel)
+        jax.eval_shape(jax.vmap(lambda x, kernel: directly(x, kernel, 2), (0, None)), x, kernel)

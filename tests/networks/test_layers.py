@@ -143,7 +143,7 @@ def test_derivatives_of_bias_and_center(rng, monkeypatch, images, on_gpu, writte
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-12), derivatives(written), derivatives(plain))
 
 
-@pytest.mark.parametrize("shape", [(4096, 3), (2, 2048, 3)])
+@pytest.mark.parametrize("shape", [(4096, 3), (2, 2048, 3), (32, 128, 3)])
 @pytest.mark.parametrize("on_gpu", [False, True])
 def test_gradients_of_bfloat16_images_are_summed_in_float32(monkeypatch, on_gpu, shape):
     # 4,096 times 1/3: a sum in bfloat16 would stop growing at 256 times as much as one of its terms.
