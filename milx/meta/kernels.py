@@ -15,7 +15,7 @@ GPU does by default, which is TF32.
 
 import math
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -49,24 +49,15 @@ def convolve(x: jax.Array, kernel: jax.Array, *, stride: int, interpret: bool = 
     shape = tuple(-(-length // stride) for length in size)
     before = [same_padding(length, taps, stride)[0] for length in size]
     count = images * shape[0] * shape[1]
-    columns = _columns(filters)
 
     def program(x, kernel, y):
         task, pixel = pl.program_id(1), _numbers(_PIXELS) + pl.program_id(0) * _PIXELS
         image, top, left = _place(pixel, shape)
-        window = image, top * stride - before[0], left * stride - before[1]
-        f, valid = _numbers(columns), pixel < count
-
-        def add(row, total):
-            for piece in _pieces(taps * channels, x.dtype):
-                under = _under(x, task, size, channels, window, row, piece, taps, valid)
-                r = _numbers(piece[1]) + piece[0]
-                mask = (r < taps * channels)[:, None] & (f < filters)[None]
-                weights = _load(kernel.at[task if shared > 1 else 0, row, r[:, None], f[None]], mask)
-                total += _product(under, weights)
-            return total
-
-        total = lax.fori_loop(0, taps, add, jnp.zeros((_PIXELS, columns), _wide(y.dtype)))
+        first, valid = (image, top * stride - before[0], left * stride - before[1]), pixel < count
+        windows = _Windows(x, task, size, channels, taps, first, valid)
+        f = _numbers(_columns(filters))
+        weights = lambda *indices: kernel.at[task if shared > 1 else 0, *indices]  # noqa: E731
+        total = _sum(windows, weights, filters)
         _store(y.at[task, pixel[:, None], f[None]], total, valid[:, None] & (f < filters)[None])
 
     y = _call(program, (tasks, count, filters), x.dtype, (pl.cdiv(count, _PIXELS), tasks), "convolve", interpret)(
@@ -92,29 +83,19 @@ def to_input(
     kernel = kernel.transpose(0, 2, 4, 1, 3, 6, 5).reshape(shared, stride, stride, fewer, fewer * filters, channels)
     coarse = tuple(-(-length // stride) for length in size)
     count = images * coarse[0] * coarse[1]
-    columns = _columns(channels)
 
     def program(dy, kernel, dx):
         task, pixel = pl.program_id(1), _numbers(_PIXELS) + pl.program_id(0) * _PIXELS
         image, top, left = _place(pixel, coarse)
-        c = _numbers(columns)
+        c = _numbers(_columns(channels))
         for kind in ((row, column) for row in range(stride) for column in range(stride)):
             y, x = top * stride + kind[0], left * stride + kind[1]
             valid = (pixel < count) & (y < size[0]) & (x < size[1])
             (down, i), (right, j) = (divmod(offset + pad, stride) for offset, pad in zip(kind, before, strict=True))
-            window = image, top + down - (fewer - 1), left + right - (fewer - 1)
-
-            def add(row, total, i=i, j=j, window=window, valid=valid):
-                for piece in _pieces(fewer * filters, dy.dtype):
-                    under = _under(dy, task, shape, filters, window, row, piece, fewer, valid)
-                    r = _numbers(piece[1]) + piece[0]
-                    mask = (r < fewer * filters)[:, None] & (c < channels)[None]
-                    weights = _load(kernel.at[task if shared > 1 else 0, i, j, row, r[:, None], c[None]], mask)
-                    total += _product(under, weights)
-                return total
-
-            rows = pl.cdiv(taps - i, stride)  # of the kernel; the rows before them are of its padding
-            total = lax.fori_loop(fewer - rows, fewer, add, jnp.zeros((_PIXELS, columns), _wide(dx.dtype)))
+            first = image, top + down - (fewer - 1), left + right - (fewer - 1)
+            windows = _Windows(dy, task, shape, filters, fewer, first, valid)
+            weights = lambda *indices, i=i, j=j: kernel.at[task if shared > 1 else 0, i, j, *indices]  # noqa: E731
+            total = _sum(windows, weights, channels, start=fewer - pl.cdiv(taps - i, stride))
             at = ((image * size[0] + y) * size[1] + x) * channels
             _store(dx.at[task, at[:, None] + c[None]], total, valid[:, None] & (c < channels)[None])
 
@@ -147,9 +128,10 @@ def to_kernel(x: jax.Array, dy: jax.Array, *, stride: int, taps: int, interpret:
         def add(step, totals):
             pixel = _numbers(_PIXELS_AT_ONCE) + (group * steps + step) * _PIXELS_AT_ONCE
             image, top, left = _place(pixel, shape)
-            window, valid = (image, top * stride - before[0], left * stride - before[1]), pixel < count
+            first, valid = (image, top * stride - before[0], left * stride - before[1]), pixel < count
+            windows = _Windows(x, task, size, channels, taps, first, valid)
             given = _load(dy.at[task, pixel[:, None], f[None]], valid[:, None] & (f < filters)[None])
-            under = [_under(x, task, size, channels, window, row, piece, taps, valid) for piece in pieces]
+            under = [_under(windows, row, piece) for piece in pieces]
             return tuple(total + _product(left, given, 0) for total, left in zip(totals, under, strict=True))
 
         start = tuple(jnp.zeros((width, columns), _wide(x.dtype)) for _, width in pieces)
@@ -165,37 +147,63 @@ def to_kernel(x: jax.Array, dy: jax.Array, *, stride: int, taps: int, interpret:
     return parts.sum(axis=0).astype(x.dtype).reshape(tasks, taps, taps, channels, filters)
 
 
-def _under(
-    images: Any,
-    task: jax.Array,
-    size: list[int],
-    channels: int,
-    window: tuple[jax.Array, jax.Array, jax.Array],
-    row: Any,
-    piece: tuple[int, int],
-    taps: int,
-    valid: jax.Array,
-) -> jax.Array:
-    """Loads a piece of what lies under a row of windows: [M, its width], zeros outside the image and the window.
+class _Windows(NamedTuple):
+    """What lies under M windows of k rows and columns.
 
-    Args:
+    Attributes:
         images: a reference to [T, B H W C] numbers.
         task: which of the T.
         size: H and W.
         channels: C.
-        window: [M] images, and the rows and columns of the windows' first pixels, which may be outside the image.
-        row: the row of the window.
-        piece: first and number of the k C numbers under a row.
         taps: k.
+        first: [M] images, and the rows and columns of the windows' first pixels, which may be outside the image.
         valid: [M] bool, whether there is such a window.
     """
-    number, top, left = window
+
+    images: Any
+    task: jax.Array
+    size: list[int]
+    channels: int
+    taps: int
+    first: tuple[jax.Array, jax.Array, jax.Array]
+    valid: jax.Array
+
+
+def _sum(windows: _Windows, weights: Callable[..., Any], filters: int, start: int = 0) -> jax.Array:
+    """Sums what lies under windows, times a kernel: [M, F], with F rounded up by `_columns`.
+
+    Args:
+        windows: M windows.
+        weights: returns a reference to numbers of the kernel from their row, their places in it, and their filters.
+        filters: F.
+        start: the kernel's rows before this one are zero.
+    """
+    f, length = _numbers(_columns(filters)), windows.taps * windows.channels
+
+    def add(row: jax.Array, total: jax.Array) -> jax.Array:
+        for piece in _pieces(length, windows.images.dtype):
+            r = _numbers(piece[1]) + piece[0]
+            mask = (r < length)[:, None] & (f < filters)[None]
+            total += _product(_under(windows, row, piece), _load(weights(row, r[:, None], f[None]), mask))
+        return total
+
+    none = jnp.zeros((len(windows.valid), len(f)), _wide(windows.images.dtype))
+    return lax.fori_loop(start, windows.taps, add, none)
+
+
+def _under(windows: _Windows, row: Any, piece: tuple[int, int]) -> jax.Array:
+    """Loads a piece, by first and width, of the k C numbers under a row of windows: [M, width].
+
+    It has zeros outside of the image and of the window.
+    """
+    (height, width), channels = windows.size, windows.channels
+    number, top, left = windows.first
     r = _numbers(piece[1]) + piece[0]
     column = left[:, None] + lax.div(r, jnp.int32(channels))[None]
-    inside = (column >= 0) & (column < size[1]) & (r < taps * channels)[None]
-    inside &= (valid & (top + row >= 0) & (top + row < size[0]))[:, None]
-    first = ((number * size[0] + top + row) * size[1] + left) * channels
-    return _load(images.at[task, first[:, None] + r[None]], inside)
+    inside = (column >= 0) & (column < width) & (r < windows.taps * channels)[None]
+    inside &= (windows.valid & (top + row >= 0) & (top + row < height))[:, None]
+    at = ((number * height + top + row) * width + left) * channels
+    return _load(windows.images.at[windows.task, at[:, None] + r[None]], inside)
 
 
 def _pieces(length: int, dtype: Any) -> Iterator[tuple[int, int]]:
@@ -221,6 +229,7 @@ def _place(pixel: jax.Array, shape: tuple[int, ...] | list[int]) -> tuple[jax.Ar
 
 
 def _columns(numbers: int) -> int:
+    """Rounds the number of filters or channels up to a width that is multiplied; raises ValueError for too many."""
     if numbers > MOST_COLUMNS:
         raise ValueError(f"filters or channels: got {numbers}, expected at most {MOST_COLUMNS}")
     return _power_of_two(numbers)

@@ -44,16 +44,16 @@ def _primitive(function: Callable[..., jax.Array]) -> Primitive:
     """Makes an operation of a function of two arrays and static settings, which are its keywords."""
     primitive = Primitive(function.__name__)
     settings = [each.name for each in inspect.signature(function).parameters.values() if each.kind == each.KEYWORD_ONLY]
-    primitive.def_impl(jax.jit(function, static_argnames=settings))
-    primitive.def_abstract_eval(lambda *args, **settings: _shaped(function, args, settings))
-    mlir.register_lowering(primitive, mlir.lower_fun(function, multiple_results=False))
+    jitted = jax.jit(function, static_argnames=settings)  # which traces it once for each shape
+
+    def shaped(*args: Any, **settings: Any) -> Any:
+        found = jitted.eval_shape(*(jax.ShapeDtypeStruct(arg.shape, arg.dtype) for arg in args), **settings)
+        return jax.core.ShapedArray(found.shape, found.dtype)
+
+    primitive.def_impl(jitted)
+    primitive.def_abstract_eval(shaped)
+    mlir.register_lowering(primitive, mlir.lower_fun(jitted, multiple_results=False))
     return primitive
-
-
-def _shaped(function: Callable[..., jax.Array], args: Sequence[Any], settings: dict[str, Any]) -> Any:
-    inputs = [jax.ShapeDtypeStruct(arg.shape, arg.dtype) for arg in args]
-    found = jax.eval_shape(functools.partial(function, **settings), *inputs)
-    return jax.core.ShapedArray(found.shape, found.dtype)
 
 
 _convolve = _primitive(kernels.convolve)
