@@ -6,14 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from lax_convolution import all_derivatives, assert_agree, reference_conv2d
 
 from milx.meta import convolution
-
-
-def reference_conv2d(x, kernel, stride):
-    return jax.lax.conv_general_dilated(
-        x, kernel, (stride, stride), padding="SAME", dimension_numbers=("NHWC", "HWIO", "NHWC")
-    )
 
 
 @functools.partial(jax.jit, static_argnums=(0, 3))
@@ -77,22 +72,11 @@ def test_kernels_gradients_by_groups_are_those_of_lax(rng, monkeypatch, filters,
     """Compares derivatives of both products of blocks, forward alone and reverse over reverse included."""
     chosen, choose = [], convolution._groups
     monkeypatch.setattr(convolution, "_groups", lambda *shapes: chosen.append(choose(*shapes)) or chosen[-1])
-    x, kernel, dx, dkernel = (
-        jnp.asarray(rng.standard_normal(shape)) for shape in 2 * ((16, 14, 17, 3), (3, 3, 3, filters))
-    )
-
-    @functools.partial(jax.jit, static_argnums=0)
-    def all_derivatives(conv):
-        cubed = lambda x, kernel: jnp.sum(conv(x, kernel, 1) ** 3)  # noqa: E731
-        _, forward = jax.jvp(lambda *inputs: conv(*inputs, 1), (x, kernel), (dx, dkernel))
-        gradient, product = jax.jvp(jax.grad(cubed, (0, 1)), (x, kernel), (dx, dkernel))
-        reverse = jax.grad(lambda kernel: jnp.vdot(jax.grad(cubed, 1)(x, kernel), dkernel))(kernel)
-        return forward, gradient, product, reverse
-
-    found, expected = all_derivatives(convolution.convolve_blocks), all_derivatives(reference_conv2d)
+    sizes = ((16, 14, 17, 3), (3, 3, 3, filters))
+    inputs, directions = (tuple(jnp.asarray(rng.standard_normal(size)) for size in sizes) for _ in range(2))
+    found = all_derivatives(convolution.convolve_blocks, inputs, directions, 1)
     assert set(chosen) == {groups}
-    for ours, theirs in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
-        np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-10 * np.abs(theirs).max())
+    assert_agree(found, all_derivatives(reference_conv2d, inputs, directions, 1), 1e-10)
 
 
 def test_gradient_of_a_kernel_that_tasks_share_is_the_sum_over_tasks(rng):
@@ -101,10 +85,7 @@ def test_gradient_of_a_kernel_that_tasks_share_is_the_sum_over_tasks(rng):
     def gradient(conv):
         return jax.grad(lambda kernel: jnp.sum(jax.vmap(lambda x: conv(x, kernel, 1))(x) ** 3))(kernel)
 
-    expected = gradient(reference_conv2d)
-    np.testing.assert_allclose(
-        gradient(convolution.convolve_blocks), expected, rtol=0, atol=1e-10 * np.abs(expected).max()
-    )
+    assert_agree(gradient(convolution.convolve_blocks), gradient(reference_conv2d), 1e-10)
 
 
 def test_kernels_gradients_by_groups_are_as_exact_as_their_products(rng):

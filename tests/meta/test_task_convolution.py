@@ -1,11 +1,10 @@
 """Convolutions by kernels of a GPU, interpreted, against `jax.lax`."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from lax_convolution import all_derivatives, assert_agree, reference_conv2d
 
 from milx.meta import kernels
 from milx.meta.task_convolution import convolve_directly
@@ -24,37 +23,14 @@ def directly(x, kernel, stride):
     return convolve_directly(x, kernel, stride, interpret=True)
 
 
-def reference(x, kernel, stride):
-    return jax.lax.conv_general_dilated(
-        x, kernel, (stride, stride), padding="SAME", dimension_numbers=("NHWC", "HWIO", "NHWC")
-    )
-
-
-def agree(found, expected):
-    for ours, theirs in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
-        np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-12 * np.abs(theirs).max())
-
-
-@functools.partial(jax.jit, static_argnums=(0, 3))
-def derivatives(conv, inputs, directions, stride):
-    """Computes derivatives of a cubic function: forward, reverse, forward over reverse, and reverse over reverse."""
-
-    def cubed(inputs):
-        return jnp.sum(conv(*inputs, stride) ** 3)
-
-    forward = jax.jvp(lambda inputs: conv(*inputs, stride), (inputs,), (directions,))
-    over_reverse = jax.jvp(jax.grad(cubed), (inputs,), (directions,))
-    along = lambda inputs: sum(map(jnp.vdot, jax.grad(cubed)(inputs), directions))  # noqa: E731
-    return forward, over_reverse, jax.grad(along)(inputs)
-
-
 @pytest.mark.parametrize("shape", SHAPES)
 def test_value_and_derivatives_are_those_of_lax(rng, monkeypatch, shape):
     images, height, width, channels, filters, taps, stride = SHAPES[shape]
     monkeypatch.setattr(kernels, "_PROGRAMS", 2 * taps)  # two of them sum, in several steps if there are 420 outputs
     sizes = ((images, height, width, channels), (taps, taps, channels, filters))
     inputs, directions = (tuple(jnp.asarray(rng.standard_normal(size)) for size in sizes) for _ in range(2))
-    agree(derivatives(directly, inputs, directions, stride), derivatives(reference, inputs, directions, stride))
+    found, expected = (all_derivatives(conv, inputs, directions, stride) for conv in (directly, reference_conv2d))
+    assert_agree(found, expected, 1e-12)
 
 
 @pytest.mark.parametrize(
@@ -75,7 +51,7 @@ def test_gradients_of_mapped_convolutions_are_those_of_lax(rng, axes):
             mapped = jax.vmap(mapped, pair)
         return jax.jit(jax.grad(lambda inputs: jnp.sum(mapped(*inputs) ** 3)))(inputs)
 
-    agree(gradient(directly), gradient(reference))
+    assert_agree(gradient(directly), gradient(reference_conv2d), 1e-12)
 
 
 def test_products_of_bfloat16_are_summed_in_float32(rng):
@@ -85,7 +61,7 @@ def test_products_of_bfloat16_are_summed_in_float32(rng):
     def gradient(conv, x, kernel):
         return jax.jit(jax.grad(lambda kernel: conv(x, kernel, 1).sum()))(kernel)
 
-    expected = gradient(reference, x.astype(float), kernel.astype(float))
+    expected = gradient(reference_conv2d, x.astype(float), kernel.astype(float))
     np.testing.assert_allclose(gradient(directly, x, kernel).astype(float), expected, rtol=2**-8)
 
 
