@@ -6,6 +6,7 @@ the hierarchy of a mesh its pixels go together: into every node that one of them
 """
 
 import functools
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -22,6 +23,7 @@ from milx.render.textures import Textures
 
 _TILE = 16  # pixels, in both directions
 _WARPS = 4
+_WORD = 32  # geoms whose bounding balls are looked at together
 _SLACK = 1.001  # bounding balls are blown up by this, so that rounding never hides a geom
 
 # Columns of the table of geoms.
@@ -130,6 +132,16 @@ def paint(
     )(geoms, lights, *tables)
 
 
+def _by_words(ranges: dict[Kind, tuple[int, int]]) -> Iterator[tuple[Kind, int, int, int]]:
+    """Cuts the ranges where a new word of bits begins: kind, word, first row and the row after the last."""
+    for kind, (first, last) in ranges.items():
+        while first < last:
+            word = first // _WORD
+            end = min(last, (word + 1) * _WORD)
+            yield kind, word, first, end
+            first = end
+
+
 def _paint_tile(geoms, lights, *rest, ranges, view) -> None:
     *tables, image = rest
     top, left = pl.program_id(0) * _TILE, pl.program_id(1) * _TILE
@@ -147,12 +159,14 @@ def _paint_tile(geoms, lights, *rest, ranges, view) -> None:
     def affine(geom, first=_AFFINE):
         return tuple(tuple(geoms[geom, first + 4 * i + j] for j in range(4)) for i in range(3))
 
-    def in_sight(geom):
-        """Tells whether the geom's ball reaches into the tile's pyramid, whose sides all contain the camera."""
+    def in_sight(first):
+        """Tells which of 32 geoms, as bits, have balls in the tile's pyramid, whose sides all contain the camera."""
+        number = jnp.arange(_WORD)
+        geom = jnp.minimum(first + number, len(geoms) - 1)
         x, y, z, radius = (geoms[geom, _BALL + i] for i in range(4))
         sides = [(x + west * z, west), (-x - east * z, east), (-y - north * z, north), (y + south * z, south)]
         distances = [inside + _SLACK * radius * jnp.sqrt(1 + slope * slope) for inside, slope in sides]
-        return functools.reduce(jnp.minimum, distances) >= 0
+        return jnp.sum(jnp.where(functools.reduce(jnp.minimum, distances) >= 0, 1 << number, 0))
 
     def nearest(t, geom, triangle, best):
         nearer = (t < best[0]) & (t > view.near) & (t < view.far)
@@ -187,15 +201,16 @@ def _paint_tile(geoms, lights, *rest, ranges, view) -> None:
         return tuple(tuple(tables[2][triangle, first + 3 * i + j] for j in range(3)) for i in range(3))
 
     best = (jnp.full(pixel.shape, jnp.inf, jnp.float32), *[jnp.zeros(pixel.shape, jnp.int32)] * 2)
-    for kind, (first, last) in ranges.items():
+    words = [in_sight(first) for first in range(0, len(geoms), _WORD)]
+    for kind, word, first, last in _by_words(ranges):
 
-        def closer(geom, best, kind=kind):
+        def closer(geom, best, kind=kind, word=word):
             def compare(best):
                 if kind == Kind.MESH:
                     return through(geom, best)
                 return nearest(raycast.enter(kind, affine(geom), geoms[geom, _STRETCH], None, rays), geom, 0, best)
 
-            return jax.lax.cond(in_sight(geom), compare, lambda best: best, best)
+            return jax.lax.cond((words[word] >> (geom - _WORD * word)) & 1 > 0, compare, lambda best: best, best)
 
         best = jax.lax.fori_loop(first, last, closer, best)
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from test_raycast import random_scene
 
-from milx.render import Renderer
+from milx.render import Renderer, kernel
 from milx.render.kernel import bounding_radius
 from milx.render.scene import to_uint8
 
@@ -35,8 +35,10 @@ def render_both(seed, hidden=()):
     return np.asarray(painted).astype(int), np.asarray(to_uint8(frame.color)).astype(int), np.asarray(frame.geom_id)
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_kernel_paints_what_the_reference_renders(seed):
+@pytest.mark.parametrize(("seed", "word"), [(0, 32), (1, 32), (2, 32), (3, 3)])
+def test_kernel_paints_what_the_reference_renders(monkeypatch, seed, word):
+    """Compares images; words of three bits look at the scene's geoms in several parts."""
+    monkeypatch.setattr(kernel, "_WORD", word)
     painted, expected, _ = render_both(seed)
     off = np.abs(painted - expected).max(axis=-1)
     # Rounding may turn a pixel over where two geoms meet.
