@@ -2,9 +2,9 @@
 
     python experiments/benchmarks/convolutions.py    # on a GPU
 
-milx convolves by kernels of a GPU (`milx.meta.task_convolution`) or by blocks, which policies use, and the peer is vmap
-over `lax.conv`. All numbers are random, and in bfloat16. A note says by how much the kernels' result differs from that
-of blocks, relative to its norm.
+milx convolves by kernels of a GPU (`milx.meta.task_convolution`), as policies do in bfloat16, or by blocks, and the
+peer is vmap over `lax.conv`. All numbers are random, and in bfloat16. A note says by how much the kernels' result
+differs from that of blocks, relative to its norm.
 """
 
 import functools

@@ -6,17 +6,9 @@ becomes a batched matrix product.
 """
 
 import functools
-import math
 
 import jax
 import jax.numpy as jnp
-from jax.custom_derivatives import SymbolicZero
-
-MANY_IMAGES = 16
-"""With so many images of a task or more, sums over images are split or done first.
-
-Presets draw at most eight time steps of a demonstration, or take all; in between the number has not been tuned.
-"""
 
 
 def same_padding(size: int, kernel: int, stride: int) -> tuple[int, int]:
@@ -28,6 +20,8 @@ def same_padding(size: int, kernel: int, stride: int) -> tuple[int, int]:
 def conv2d(x: jax.Array, kernel: jax.Array, stride: int) -> jax.Array:
     """Convolves in two dimensions with SAME padding: on a CPU by patches, on accelerators by blocks.
 
+    A GPU has kernels of its own for bfloat16 and at most 64 channels and filters.
+
     Args:
         x: [B, H, W, C].
         kernel: [k, k, C, F].
@@ -36,8 +30,13 @@ def conv2d(x: jax.Array, kernel: jax.Array, stride: int) -> jax.Array:
     Returns:
         [B, ceil(H / stride), ceil(W / stride), F].
     """
-    by = convolve_patches if jax.default_backend() == "cpu" else convolve_blocks
-    return by(x, kernel, stride)
+    if jax.default_backend() == "cpu":
+        return convolve_patches(x, kernel, stride)
+    if jax.default_backend() == "gpu" and jnp.result_type(x, kernel) == jnp.bfloat16 and max(kernel.shape) <= 64:
+        from milx.meta.task_convolution import convolve_directly  # Pallas takes a quarter of a second to import
+
+        return convolve_directly(x, kernel, stride)
+    return convolve_blocks(x, kernel, stride)
 
 
 def convolve_patches(x: jax.Array, kernel: jax.Array, stride: int) -> jax.Array:
@@ -54,49 +53,6 @@ def convolve_patches(x: jax.Array, kernel: jax.Array, stride: int) -> jax.Array:
 def _product(x: jax.Array, weights: jax.Array) -> jax.Array:
     """Multiplies [.., K] by [K, F] as plain matrices: with more axes XLA also copies the output's gradient."""
     return (x.reshape(-1, x.shape[-1]) @ weights).reshape(*x.shape[:-1], -1)
-
-
-@jax.custom_jvp
-def _product_by_groups(x: jax.Array, weights: jax.Array) -> jax.Array:
-    """Computes `_product` of [B, .., K] and [K, F], whose derivative x dW is one product for each group of images.
-
-    Its transpose, the gradient by W, is then a sum of several smaller products, which together keep all of a GPU busy.
-    XLA would split the product as well, but first copies x and the output's gradient to fill up their rows.
-    """
-    return _product(x, weights)
-
-
-@functools.partial(_product_by_groups.defjvp, symbolic_zeros=True)
-def _product_by_groups_jvp(primals: tuple, tangents: tuple) -> tuple[jax.Array, jax.Array]:
-    """Computes x W, and dx W + x dW."""
-    (x, weights), (dx, dweights) = primals, tangents
-    y = _product_by_groups(x, weights)
-    dy = jnp.zeros_like(y)
-    if not isinstance(dx, SymbolicZero):
-        dy += _product_by_groups(dx, weights)
-    if isinstance(dweights, SymbolicZero):
-        return y, dy
-    if (groups := _groups(x.shape, weights.shape)) == 1:
-        return y, dy + _product(x, dweights)
-    rows = x.reshape(groups, -1, x.shape[-1])
-    # The copies depend on x, so that `vmap` over tasks makes some for every task even where tasks share the weights:
-    # otherwise XLA reorders x, to multiply the same group of all tasks at once.
-    copies = dweights * (1 + 0 * rows[:, :1, :1])
-    # Without the barrier XLA computes the output's gradient once for each of the two products that read it.
-    return y, jax.lax.optimization_barrier(dy + (rows @ copies).reshape(y.shape))
-
-
-def _groups(x: tuple[int, ...], weights: tuple[int, int]) -> int:
-    """Chooses the most groups of B images that leave each at least 16 K F / (K + F) rows; one group of few images.
-
-    What their products write, K F numbers each, is then at most a sixteenth of what they read, K + F numbers a row.
-    Batches of few images of a task have many tasks, which keep a GPU busy without groups.
-    """
-    inputs, outputs = weights
-    least = 16 * inputs * outputs / (inputs + outputs)
-    rows = math.prod(x[:-1])
-    most = x[0] if x[0] >= MANY_IMAGES else 1
-    return max(n for n in range(1, most + 1) if n == 1 or (x[0] % n == 0 and rows >= n * least))
 
 
 def convolve_blocks(x: jax.Array, kernel: jax.Array, stride: int) -> jax.Array:
@@ -123,9 +79,9 @@ def convolve_blocks(x: jax.Array, kernel: jax.Array, stride: int) -> jax.Array:
     places = [(i, j) for i in range(2) for j in range(2)]
     if step * step * channels < tile * tile * filters:
         neighbors = [blocks[:, i : i + rows, j : j + cols] for i, j in places]
-        y = _product_by_groups(jnp.concatenate(neighbors, axis=-1), weights.reshape(-1, tile * tile * filters))
+        y = _product(jnp.concatenate(neighbors, axis=-1), weights.reshape(-1, tile * tile * filters))
     else:
-        products = jnp.split(_product_by_groups(blocks, jnp.concatenate(list(weights), axis=-1)), len(places), axis=-1)
+        products = jnp.split(_product(blocks, jnp.concatenate(list(weights), axis=-1)), len(places), axis=-1)
         shifted = [z[:, i : i + rows, j : j + cols] for z, (i, j) in zip(products, places, strict=True)]
         y = functools.reduce(jnp.add, shifted)
 

@@ -1,18 +1,21 @@
 """Convolutions of tasks, each with a kernel of its own, as kernels of a GPU: the value and both of its transposes.
 
-With stride s, and a rows and a' columns of zeros before the image (TensorFlow's SAME), all three are sums over
+With stride s, and a rows and a' columns of zeros before the image, all three are sums over
 
     y[t, b, p, q, f] = sum over i, j, c of x[t, b, s p + i - a, s q + j - a', c] W[t, i, j, c, f],
 
-which is linear in x and in W. Each program multiplies matrices: what lies under row i of the window of many outputs,
-where j and c are next to each other in memory, by row i of the kernel. So images are read from the caches of the GPU
-as often as windows overlap, and windows are not copied.
+which is linear in x and in W. The value, and its transpose in x, are products of windows and weights; the transpose in
+W is a product of windows and tiles (`tiles.py`). A program keeps its place in the image and goes from image to image,
+so that what lies outside, and the weights, are the same for all of them. Windows are read from the caches of the GPU as
+often as they overlap, and are not copied.
 
-All raise a ValueError for more than `MOST_COLUMNS` filters or `MOST_NUMBERS` numbers in an array, those of all tasks
-together. Products are summed in float32, or in float64 where the numbers are. Numbers of 32 bits are multiplied as the
-GPU does by default, which is TF32.
+All raise a ValueError for more than `MOST_CHANNELS` channels or filters, or `MOST_NUMBERS` numbers in an array, those
+of all tasks together. Products are summed in float32, or in float64 where the numbers are. Numbers of 32 bits are
+multiplied as the GPU does by default, which is TF32.
 """
 
+import functools
+import itertools
 import math
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
@@ -23,195 +26,222 @@ from jax import lax
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton
 
-from milx.meta.convolution import same_padding
+from milx.meta.operations import MOST_NUMBERS
+from milx.meta.tiles import Geometry, Pair, Places, Tiles, of_inputs, of_outputs, places
 
-_PIXELS = 128
-"""Outputs of a program."""
-_PIXELS_AT_ONCE = 64
-"""Outputs in a step of a program that sums over them."""
-_PROGRAMS = 528
-"""Programs that `to_kernel` starts if there are enough outputs: four for each multiprocessor of an H100 or H200."""
+MOST_CHANNELS = 64
+"""Most filters, and channels of images: a program keeps sums for all of them."""
+# The numbers below were chosen by timing push's and reach's layers on an H200, in bfloat16.
 _LEAST = 16
 """Least side of the matrices that are multiplied."""
 _BYTES = 256
-"""Most bytes in a row of the left matrix."""
-_WARPS = 4
-MOST_COLUMNS = 128
-"""Most filters, and most channels of images that need a gradient: a program sums as many numbers for each output."""
-MOST_NUMBERS = 2**31 - 2**16
-"""Most numbers in an array, so that 32 bits count them, and the outputs that the last programs have beyond its end."""
+"""Most bytes in a row of the left matrix, and of a column."""
+_KEPT = 96 * 1024
+"""Most bytes of weights that a program keeps; it reads more of them anew for every image."""
+_SUMS = 8192
+"""Most sums for all rows of a window that a program keeps; more are shared by a program for each row."""
+_MULTIPLYING, _SUMMING = 1056, 264
+"""Programs to start at least: eight, or two, for each multiprocessor of an H200."""
 
 
-def convolve(x: jax.Array, kernel: jax.Array, *, stride: int, interpret: bool = False) -> jax.Array:
+def convolve(x: jax.Array, kernel: jax.Array, *, geometry: Geometry, interpret: bool = False) -> jax.Array:
     """Computes y, [T, B, P, Q, F], of x, [T, B, H, W, C], and W, [T, k, k, C, F], or [1, k, k, C, F] for all tasks."""
-    tasks, images, *size, channels = x.shape
-    shared, taps, _, _, filters = kernel.shape
-    shape = tuple(-(-length // stride) for length in size)
-    before = [same_padding(length, taps, stride)[0] for length in size]
-    count = images * shape[0] * shape[1]
-
-    def program(x, kernel, y):
-        task, pixel = pl.program_id(1), _numbers(_PIXELS) + pl.program_id(0) * _PIXELS
-        image, top, left = _place(pixel, shape)
-        first, valid = (image, top * stride - before[0], left * stride - before[1]), pixel < count
-        windows = _Windows(x, task, size, channels, taps, first, valid)
-        f = _numbers(_columns(filters))
-        weights = lambda *indices: kernel.at[task if shared > 1 else 0, *indices]  # noqa: E731
-        total = _sum(windows, weights, filters)
-        _store(y.at[task, pixel[:, None], f[None]], total, valid[:, None] & (f < filters)[None])
-
-    y = _call(program, (tasks, count, filters), x.dtype, (pl.cdiv(count, _PIXELS), tasks), "convolve", interpret)(
-        x.reshape(tasks, -1), kernel.reshape(shared, taps, taps * channels, filters)
-    )
-    return y.reshape(tasks, images, *shape, filters)
+    channels, filters = kernel.shape[3:]
+    wide = 2 if filters <= 32 else 1
+    one, two = (of_outputs(geometry, channels, filters, (rows, wide), x.dtype.itemsize) for rows in (1, 2))
+    tiles = two if channels > 4 and _kept(two, geometry.taps, x.dtype) else one
+    return _multiply(x, kernel, tiles, (filters, 1), "convolve", interpret)
 
 
-def to_input(
-    dy: jax.Array, kernel: jax.Array, *, stride: int, size: tuple[int, int], interpret: bool = False
-) -> jax.Array:
-    """Computes the transpose in x, [T, B, H, W, C], of dy, [T, B, P, Q, F], by W, [T, k, k, C, F] or [1, k, k, C, F].
+def to_input(dy: jax.Array, kernel: jax.Array, *, geometry: Geometry, interpret: bool = False) -> jax.Array:
+    """Computes the transpose in x, [T, B, H, W, C], of dy, [T, B, P, Q, F], by W, which is as in `convolve`."""
+    channels, filters = kernel.shape[3:]
+    return _multiply(dy, kernel, of_inputs(geometry, channels, filters), (1, filters), "to_input", interpret)
 
-    Pixels whose row and column leave the same remainders by s meet the same rows and columns of the kernel, every s-th
-    of them, in reverse. So each of the s² kinds of pixels is what a convolution with a smaller kernel gives.
+
+def to_kernel(x: jax.Array, dy: jax.Array, *, geometry: Geometry, interpret: bool = False) -> jax.Array:
+    """Computes the transpose in W, [T, k, k, C, F], of dy, [T, B, P, Q, F], by x, [T, B, H, W, C].
+
+    Programs sum over some of the pixels each, and their sums are added.
     """
-    tasks, images, *shape, filters = dy.shape
-    shared, taps, _, channels, _ = kernel.shape
-    fewer = pl.cdiv(taps, stride)
-    before = [same_padding(length, taps, stride)[0] for length in size]
-    kernel = jnp.pad(kernel, ((0, 0), *[(0, fewer * stride - taps)] * 2, (0, 0), (0, 0)))
-    kernel = kernel.reshape(shared, fewer, stride, fewer, stride, channels, filters)[:, ::-1, :, ::-1]
-    kernel = kernel.transpose(0, 2, 4, 1, 3, 6, 5).reshape(shared, stride, stride, fewer, fewer * filters, channels)
-    coarse = tuple(-(-length // stride) for length in size)
-    count = images * coarse[0] * coarse[1]
-
-    def program(dy, kernel, dx):
-        task, pixel = pl.program_id(1), _numbers(_PIXELS) + pl.program_id(0) * _PIXELS
-        image, top, left = _place(pixel, coarse)
-        c = _numbers(_columns(channels))
-        for kind in ((row, column) for row in range(stride) for column in range(stride)):
-            y, x = top * stride + kind[0], left * stride + kind[1]
-            valid = (pixel < count) & (y < size[0]) & (x < size[1])
-            (down, i), (right, j) = (divmod(offset + pad, stride) for offset, pad in zip(kind, before, strict=True))
-            first = image, top + down - (fewer - 1), left + right - (fewer - 1)
-            windows = _Windows(dy, task, shape, filters, fewer, first, valid)
-            weights = lambda *indices, i=i, j=j: kernel.at[task if shared > 1 else 0, i, j, *indices]  # noqa: E731
-            total = _sum(windows, weights, channels, start=fewer - pl.cdiv(taps - i, stride))
-            at = ((image * size[0] + y) * size[1] + x) * channels
-            _store(dx.at[task, at[:, None] + c[None]], total, valid[:, None] & (c < channels)[None])
-
-    numbers = images * size[0] * size[1] * channels
-    dx = _call(program, (tasks, numbers), dy.dtype, (pl.cdiv(count, _PIXELS), tasks), "to_input", interpret)(
-        dy.reshape(tasks, -1), kernel
-    )
-    return dx.reshape(tasks, images, *size, channels)
+    stride, taps = geometry.stride, geometry.taps
+    channels, filters = x.shape[-1], dy.shape[-1]
+    tiles = of_outputs(geometry, channels, filters, (1, 2 if filters <= 16 else 1), x.dtype.itemsize)
+    sums = _sum_products(x, dy, tiles, interpret)
+    pixels = (sums[:, :, stride * j : stride * j + taps, :, j] for j in range(tiles.tile[1]))
+    return functools.reduce(jnp.add, pixels).astype(x.dtype)
 
 
-def to_kernel(x: jax.Array, dy: jax.Array, *, stride: int, taps: int, interpret: bool = False) -> jax.Array:
-    """Computes the transpose in W, [T, k, k, C, F], of dy, [T, B, P, Q, F], by x, [T, B, H, W, C]; k are the taps.
-
-    Several programs sum over some of the outputs each, for a row of the kernel, and their sums are added.
-    """
-    tasks, images, *size, channels = x.shape
-    *shape, filters = dy.shape[2:]
-    before = [same_padding(length, taps, stride)[0] for length in size]
-    pieces = list(_pieces(taps * channels, x.dtype))
-    count = images * shape[0] * shape[1]
-    columns = _columns(filters)
-    steps = pl.cdiv(count, _PIXELS_AT_ONCE)
-    groups = min(steps, pl.cdiv(_PROGRAMS, tasks * taps))
-    steps = pl.cdiv(steps, groups)
-
-    def program(x, dy, dkernel):
-        row, group, task = (pl.program_id(axis) for axis in range(3))
-        f = _numbers(columns)
-
-        def add(step, totals):
-            pixel = _numbers(_PIXELS_AT_ONCE) + (group * steps + step) * _PIXELS_AT_ONCE
-            image, top, left = _place(pixel, shape)
-            first, valid = (image, top * stride - before[0], left * stride - before[1]), pixel < count
-            windows = _Windows(x, task, size, channels, taps, first, valid)
-            given = _load(dy.at[task, pixel[:, None], f[None]], valid[:, None] & (f < filters)[None])
-            under = [_under(windows, row, piece) for piece in pieces]
-            return tuple(total + _product(left, given, 0) for total, left in zip(totals, under, strict=True))
-
-        start = tuple(jnp.zeros((width, columns), _wide(x.dtype)) for _, width in pieces)
-        for (first, width), total in zip(pieces, lax.fori_loop(0, steps, add, start), strict=True):
-            r = _numbers(width) + first
-            mask = (r < taps * channels)[:, None] & (f < filters)[None]
-            _store(dkernel.at[group, task, row, r[:, None], f[None]], total, mask)
-
-    sums = groups, tasks, taps, taps * channels, filters
-    parts = _call(program, sums, _wide(x.dtype), (taps, groups, tasks), "to_kernel", interpret)(
-        x.reshape(tasks, -1), dy.reshape(tasks, count, filters)
-    )
-    return parts.sum(axis=0).astype(x.dtype).reshape(tasks, taps, taps, channels, filters)
-
-
-class _Windows(NamedTuple):
-    """What lies under M windows of k rows and columns.
-
-    Attributes:
-        images: a reference to [T, B H W C] numbers.
-        task: which of the T.
-        size: H and W.
-        channels: C.
-        taps: k.
-        first: [M] images, and the rows and columns of the windows' first pixels, which may be outside the image.
-        valid: [M] bool, whether there is such a window.
-    """
-
-    images: Any
-    task: jax.Array
-    size: list[int]
-    channels: int
-    taps: int
-    first: tuple[jax.Array, jax.Array, jax.Array]
-    valid: jax.Array
-
-
-def _sum(windows: _Windows, weights: Callable[..., Any], filters: int, start: int = 0) -> jax.Array:
-    """Sums what lies under windows, times a kernel: [M, F], with F rounded up by `_columns`.
+def _multiply(x: jax.Array, kernel: jax.Array, tiles: Tiles, strides: Pair, name: str, interpret: bool) -> jax.Array:
+    """Multiplies windows by weights: [T, B, rows, columns, channels] that are written.
 
     Args:
-        windows: M windows.
-        weights: returns a reference to numbers of the kernel from their row, their places in it, and their filters.
-        filters: F.
-        start: the kernel's rows before this one are zero.
+        x: [T, B, ...], the images that are read.
+        kernel: [T, k, k, C, F] or [1, k, k, C, F].
+        tiles: what is computed.
+        strides: from a channel that is read, and from one that is written, to the next in the kernel's memory.
+        name: of the operation.
+        interpret: run on any device, slowly, for tests.
     """
-    f, length = _numbers(_columns(filters)), windows.taps * windows.channels
+    (tasks, images), (shared, taps) = x.shape[:2], kernel.shape[:2]
+    columns, pieces, pairs = _columns(tiles), list(_pieces(tiles, x.dtype)), _pairs(tiles, taps)
+    kept, sums = _kept(tiles, taps, x.dtype), tiles.tile[0] * columns
+    at = places(tiles, images, _BYTES // x.dtype.itemsize, tasks, _MULTIPLYING)
 
-    def add(row: jax.Array, total: jax.Array) -> jax.Array:
-        for piece in _pieces(length, windows.images.dtype):
-            r = _numbers(piece[1]) + piece[0]
-            mask = (r < length)[:, None] & (f < filters)[None]
-            total += _product(_under(windows, row, piece), _load(weights(row, r[:, None], f[None]), mask))
-        return total
+    def program(x, kernel, y):
+        place, chunk, task = (pl.program_id(axis) for axis in range(3))
+        spot = _spot(at, place)
 
-    none = jnp.zeros((len(windows.valid), len(f)), _wide(windows.images.dtype))
-    return lax.fori_loop(start, windows.taps, add, none)
+        def load(row: int, pixel: int, piece: Pair) -> jax.Array:
+            where, inside = _of_weights(tiles, taps, row, pixel, piece, strides)
+            return _load(kernel.at[task if shared > 1 else 0, where], inside)
+
+        weights = {(*pair, piece): load(*pair, piece) for pair in pairs for piece in pieces} if kept else {}
+
+        def step(number, carried):
+            number += chunk * at.steps
+            totals = [jnp.zeros((len(spot.row), columns), _wide(x.dtype)) for _ in range(tiles.tile[0])]
+            for row, piece in itertools.product(dict(pairs), pieces):
+                where, inside = _at_step(_of_windows(tiles, spot, row, piece), tiles.read, at, spot, number, images)
+                windows = _load(x.at[task, where], inside)
+                for pixel in (pixel for other, pixel in pairs if other == row):
+                    right = weights[row, pixel, piece] if kept else load(row, pixel, piece)
+                    totals[pixel] += _product(windows, right, 1)
+            for pixel, total in enumerate(totals):
+                where, inside = _at_step(_of_tiles(tiles, spot, pixel), tiles.written, at, spot, number, images)
+                _store(y.at[task, where], total, inside)
+            return carried
+
+        lax.fori_loop(0, at.steps, step, 0)
+
+    grid = math.prod(at.grid), at.chunks, tasks
+    shape = tasks, images * math.prod(tiles.written)
+    call = _call(program, shape, x.dtype, grid, name, 4 if sums <= 128 else 8, 1, interpret)
+    return call(x.reshape(tasks, -1), kernel.reshape(shared, -1)).reshape(tasks, images, *tiles.written)
 
 
-def _under(windows: _Windows, row: Any, piece: tuple[int, int]) -> jax.Array:
-    """Loads a piece, by first and width, of the k C numbers under a row of windows: [M, width].
+def _sum_products(x: jax.Array, dy: jax.Array, tiles: Tiles, interpret: bool) -> jax.Array:
+    """Sums the products of windows and tiles of one row, u' outputs: [T, rows and columns of a window, C, u', F]."""
+    tasks, images = x.shape[:2]
+    columns, pieces = _columns(tiles), list(_pieces(tiles, x.dtype))
+    (rows, length), channels = tiles.window, tiles.read[2]
+    sums = rows * columns * sum(width for _, width in pieces)
+    alone = sums <= _SUMS  # a program keeps the sums for all rows of a window
+    others = tasks if alone else tasks * rows
+    count = 64 if not alone or sums <= _SUMS // 2 else 32
+    at = places(tiles, images, max(_LEAST, count * 2 // x.dtype.itemsize), others, _SUMMING)
 
-    It has zeros outside of the image and of the window.
+    def program(x, dy, found):
+        place, chunk, task = (pl.program_id(axis) for axis in range(3))
+        mine = list(range(rows)) if alone else [place % rows]
+        place = place if alone else place // rows
+        spot, n = _spot(at, place), _numbers(columns)
+
+        def step(number, totals):
+            number += chunk * at.steps
+            where, inside = _at_step(_of_tiles(tiles, spot, 0), tiles.written, at, spot, number, images)
+            given, more = _load(dy.at[task, where], inside), []
+            for total, (row, piece) in zip(totals, itertools.product(mine, pieces), strict=True):
+                where, inside = _at_step(_of_windows(tiles, spot, row, piece), tiles.read, at, spot, number, images)
+                more.append(total + _product(_load(x.at[task, where], inside), given, 0))
+            return tuple(more)
+
+        start = tuple(jnp.zeros((width, columns), _wide(x.dtype)) for _ in mine for _, width in pieces)
+        totals = lax.fori_loop(0, at.steps, step, start)
+        for (row, (first, width)), total in zip(itertools.product(mine, pieces), totals, strict=True):
+            r = _numbers(width)[:, None] + first
+            inside = (r < length * channels) & (n < tiles.tile[1] * tiles.written[2])[None]
+            _store(found.at[place * at.chunks + chunk, task, row, r, n[None]], total, inside)
+
+    parts = math.prod(at.grid) * at.chunks
+    shape = parts, tasks, rows, length * channels, tiles.tile[1] * tiles.written[2]
+    grid = math.prod(at.grid) * (1 if alone else rows), at.chunks, tasks
+    call = _call(program, shape, _wide(x.dtype), grid, "to_kernel", *((2, 1) if alone else (4, 3)), interpret)
+    total = call(x.reshape(tasks, -1), dy.reshape(tasks, -1)).sum(axis=0)
+    return total.reshape(tasks, rows, length, channels, tiles.tile[1], tiles.written[2])
+
+
+class _Spot(NamedTuple):
+    """The M tiles that a program has at once: [M] images, counted from its first, rows and columns."""
+
+    image: jax.Array
+    row: jax.Array
+    column: jax.Array
+
+
+def _spot(at: Places, place: jax.Array) -> _Spot:
+    number = _numbers(at.images * at.rows * at.columns)
+    rest = number // at.columns
+    first = place // at.grid[1] * at.rows, place % at.grid[1] * at.columns
+    return _Spot(rest // at.rows, first[0] + rest % at.rows, first[1] + number % at.columns)
+
+
+def _of_windows(tiles: Tiles, spot: _Spot, row: Any, piece: Pair) -> tuple[jax.Array, jax.Array]:
+    """Finds a piece, by first and width, of a row of each window, whose numbers are next to each other.
+
+    Returns:
+        Where they are, as if the program began with the first image, and whether they are in the image: [M, width].
     """
-    (height, width), channels = windows.size, windows.channels
-    number, top, left = windows.first
+    height, width, channels = tiles.read
     r = _numbers(piece[1]) + piece[0]
-    column = left[:, None] + lax.div(r, jnp.int32(channels))[None]
-    inside = (column >= 0) & (column < width) & (r < windows.taps * channels)[None]
-    inside &= (windows.valid & (top + row >= 0) & (top + row < height))[:, None]
-    at = ((number * height + top + row) * width + left) * channels
-    return _load(windows.images.at[windows.task, at[:, None] + r[None]], inside)
+    top = spot.row * tiles.step[0] - tiles.before[0] + row
+    along = ((spot.column * tiles.step[1] - tiles.before[1]) * channels)[:, None] + r[None]
+    inside = (along >= 0) & (along < width * channels) & ((top >= 0) & (top < height))[:, None]
+    if sum(piece) > tiles.window[1] * channels:
+        inside &= (r < tiles.window[1] * channels)[None]
+    return ((spot.image * height + top) * (width * channels))[:, None] + along, inside
 
 
-def _pieces(length: int, dtype: Any) -> Iterator[tuple[int, int]]:
-    """Cuts `length` numbers of a type into pieces: first and width of each.
+def _of_tiles(tiles: Tiles, spot: _Spot, pixel: int) -> tuple[jax.Array, jax.Array]:
+    """Finds a row of each tile, as `_of_windows` does: [M, columns]."""
+    height, width, channels = tiles.written
+    n = _numbers(_columns(tiles))
+    top = spot.row * tiles.tile[0] + pixel
+    along = (spot.column * (tiles.tile[1] * channels))[:, None] + n[None]
+    inside = (along < width * channels) & (top < height)[:, None]
+    if len(n) > tiles.tile[1] * channels:
+        inside &= (n < tiles.tile[1] * channels)[None]
+    return ((spot.image * height + top) * (width * channels))[:, None] + along, inside
+
+
+def _at_step(where: tuple, size: tuple[int, int, int], at: Places, spot: _Spot, step: Any, images: int) -> tuple:
+    """Moves on to the images, of a size, of a step; the last step may have fewer of them."""
+    numbers, inside = where
+    if images % at.images:
+        inside &= (step * at.images + spot.image < images)[:, None]
+    return step * (at.images * math.prod(size)) + numbers, inside
+
+
+def _pairs(tiles: Tiles, taps: int) -> list[Pair]:
+    """Lists the rows of windows and of tiles that meet at a tap of the kernel, by the first."""
+    rows = itertools.product(range(tiles.window[0]), range(tiles.tile[0]))
+    return [(row, pixel) for row, pixel in rows if 0 <= tiles.taps[0].at(row, pixel) < taps]
+
+
+def _of_weights(
+    tiles: Tiles, taps: int, row: int, pixel: int, piece: Pair, strides: Pair
+) -> tuple[jax.Array, jax.Array]:
+    """Finds the weights of a piece of a row of windows, and of a row of tiles: [width, columns], as `_of_windows`."""
+    (_, _, read), (_, _, written) = tiles.read, tiles.written
+    r, n = _numbers(piece[1])[:, None] + piece[0], _numbers(_columns(tiles))[None]
+    tap = tiles.taps[1].at(r // read, n // written)
+    inside = (tap >= 0) & (tap < taps) & (r < tiles.window[1] * read) & (n < tiles.tile[1] * written)
+    where = (tiles.taps[0].at(row, pixel) * taps + tap) * (read * written)
+    return where + r % read * strides[0] + n % written * strides[1], inside
+
+
+def _kept(tiles: Tiles, taps: int, dtype: Any) -> bool:
+    """Tells whether a program keeps all weights."""
+    width = sum(width for _, width in _pieces(tiles, dtype))
+    return len(_pairs(tiles, taps)) * width * _columns(tiles) * jnp.dtype(dtype).itemsize <= _KEPT
+
+
+def _pieces(tiles: Tiles, dtype: Any) -> Iterator[Pair]:
+    """Cuts the numbers of a row of a window into pieces: first and width of each.
 
     Widths are powers of two, so the last piece may reach beyond the end.
     """
-    first = 0
+    first, length = 0, tiles.window[1] * tiles.read[2]
     while first < length:
         rest = length - first
         width = min(_power_of_two(rest), _BYTES // jnp.dtype(dtype).itemsize)
@@ -221,18 +251,12 @@ def _pieces(length: int, dtype: Any) -> Iterator[tuple[int, int]]:
         first += width
 
 
-def _place(pixel: jax.Array, shape: tuple[int, ...] | list[int]) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Finds image, row and column of each of B P Q pixels; the quotients of positive numbers need no rounding."""
-    line = lax.div(pixel, jnp.int32(shape[1]))
-    image = lax.div(line, jnp.int32(shape[0]))
-    return image, line - image * shape[0], pixel - line * shape[1]
-
-
-def _columns(numbers: int) -> int:
-    """Rounds the number of filters or channels up to a width that is multiplied; raises ValueError for too many."""
-    if numbers > MOST_COLUMNS:
-        raise ValueError(f"filters or channels: got {numbers}, expected at most {MOST_COLUMNS}")
-    return _power_of_two(numbers)
+def _columns(tiles: Tiles) -> int:
+    """Rounds the numbers of a row of a tile up to a width that is multiplied; raises ValueError for too many."""
+    for channels in (tiles.read[2], tiles.written[2]):
+        if channels > MOST_CHANNELS:
+            raise ValueError(f"filters or channels: got {channels}, expected at most {MOST_CHANNELS}")
+    return _power_of_two(tiles.tile[1] * tiles.written[2])
 
 
 def _power_of_two(length: int) -> int:
@@ -247,7 +271,7 @@ def _wide(dtype: Any) -> Any:
     return jnp.promote_types(dtype, jnp.float32)
 
 
-def _product(a: jax.Array, b: jax.Array, contract: int = 1) -> jax.Array:
+def _product(a: jax.Array, b: jax.Array, contract: int) -> jax.Array:
     """Multiplies [M, K], or [K, M] if its axis 0 is contracted, by [K, N]."""
     axes = (((contract,), (0,)), ((), ()))
     return lax.dot_general(a, b, axes, preferred_element_type=_wide(a.dtype))
@@ -262,14 +286,21 @@ def _store(reference: Any, value: jax.Array, mask: jax.Array) -> None:
 
 
 def _call(
-    program: Any, shape: tuple[int, ...], dtype: Any, grid: tuple[int, ...], name: str, interpret: bool
+    program: Any,
+    shape: tuple[int, ...],
+    dtype: Any,
+    grid: tuple[int, ...],
+    name: str,
+    warps: int,
+    stages: int,
+    interpret: bool,
 ) -> Callable[..., jax.Array]:
     """Returns a function of arrays that runs the program on a grid."""
     call = pl.pallas_call(
         program,
         out_shape=jax.ShapeDtypeStruct(shape, dtype),
         grid=grid,
-        compiler_params=triton.CompilerParams(num_warps=_WARPS, num_stages=3),
+        compiler_params=triton.CompilerParams(num_warps=warps, num_stages=stages),
         interpret=interpret,
         name=name,
     )

@@ -6,7 +6,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from milx.meta.convolution import MANY_IMAGES, conv2d
+from milx.meta.convolution import conv2d
 
 
 def positions(height: int, width: int) -> jax.Array:
@@ -92,20 +92,12 @@ shifted_relu.defvjp(_shifted_relu_forward, _shifted_relu_backward)
 
 
 def _sum_over_pixels(x: jax.Array, dtype: jnp.dtype) -> jax.Array:
-    """Sums [B, .., F] to [F].
+    """Sums [B, .., F] to [F]."""
+    if jax.default_backend() != "gpu":
+        return x.reshape(-1, x.shape[-1]).sum(axis=0, dtype=dtype)
+    from milx.meta.pixel_sums import sum_over_pixels  # Pallas takes a quarter of a second to import
 
-    XLA's sum is slow on accelerators where few channels remain, so many images are summed over images first, and few
-    are multiplied by ones.
-    """
-    flat = x.reshape(-1, x.shape[-1])
-    if jax.default_backend() == "cpu":
-        return flat.sum(axis=0, dtype=dtype)
-    if len(x) >= MANY_IMAGES:
-        image = x.sum(axis=0, dtype=dtype)
-        image = jax.lax.optimization_barrier(image)  # without it XLA makes one sum of the two again
-        return image.reshape(-1, x.shape[-1]).sum(axis=0)
-    ones = jnp.ones((8, len(flat)), x.dtype)  # of a product with a single row XLA would make a sum again
-    return jnp.matmul(ones, flat, precision=jax.lax.Precision.HIGHEST, preferred_element_type=dtype)[0]
+    return sum_over_pixels(x).astype(dtype)
 
 
 class Conv(nn.Module):

@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from lax_convolution import all_derivatives, assert_agree, reference_conv2d
+from lax_convolution import assert_agree, reference_conv2d
 
-from milx.meta import convolution
+from milx.meta import convolution, task_convolution
 
 
 @functools.partial(jax.jit, static_argnums=(0, 3))
@@ -67,18 +67,6 @@ def test_convolution_with_every_tasks_own_kernel_is_a_loop_of_lax(rng, convolve)
     np.testing.assert_allclose(found, expected, atol=1e-12)
 
 
-@pytest.mark.parametrize(("filters", "groups"), [(4, 4), (2, 8)])
-def test_kernels_gradients_by_groups_are_those_of_lax(rng, monkeypatch, filters, groups):
-    """Compares derivatives of both products of blocks, forward alone and reverse over reverse included."""
-    chosen, choose = [], convolution._groups
-    monkeypatch.setattr(convolution, "_groups", lambda *shapes: chosen.append(choose(*shapes)) or chosen[-1])
-    sizes = ((16, 14, 17, 3), (3, 3, 3, filters))
-    inputs, directions = (tuple(jnp.asarray(rng.standard_normal(size)) for size in sizes) for _ in range(2))
-    found = all_derivatives(convolution.convolve_blocks, inputs, directions, 1)
-    assert set(chosen) == {groups}
-    assert_agree(found, all_derivatives(reference_conv2d, inputs, directions, 1), 1e-10)
-
-
 def test_gradient_of_a_kernel_that_tasks_share_is_the_sum_over_tasks(rng):
     x, kernel = jnp.asarray(rng.standard_normal((3, 16, 14, 17, 3))), jnp.asarray(rng.standard_normal((3, 3, 3, 4)))
 
@@ -88,24 +76,15 @@ def test_gradient_of_a_kernel_that_tasks_share_is_the_sum_over_tasks(rng):
     assert_agree(gradient(convolution.convolve_blocks), gradient(reference_conv2d), 1e-10)
 
 
-def test_kernels_gradients_by_groups_are_as_exact_as_their_products(rng):
-    """Bounds the error of a sum of eight groups' products: they, the sum, and what they are made of have 8 bits."""
-    x, kernel = (jnp.asarray(rng.standard_normal(shape)) for shape in ((16, 14, 17, 3), (3, 3, 3, 2)))
-    x, kernel = (value.astype(jnp.bfloat16).astype(float) for value in (x, kernel))
-
-    def gradient(x, kernel):
-        return jax.grad(lambda kernel: jnp.sum(convolution.convolve_blocks(x, kernel, 1)))(kernel).astype(float)
-
-    exact, rough = gradient(x, kernel), gradient(x.astype(jnp.bfloat16), kernel.astype(jnp.bfloat16))
-    distance = jnp.linalg.norm(rough - exact) / jnp.linalg.norm(exact)
-    assert 1e-4 < distance < 2**-7
-
-
-def test_groups_write_at_most_a_sixteenth_of_what_they_read():
-    for x, weights in (((100, 17, 17, 256), (256, 256)), ((50, 17, 21, 160), (160, 160)), ((18, 5, 5, 7), (7, 3))):
-        groups = convolution._groups(x, weights)
-        read = np.prod(x[:-1]) * sum(weights)
-        larger = [n for n in range(groups + 1, x[0] + 1) if x[0] % n == 0]
-        assert groups > 1 and x[0] % groups == 0 and 16 * groups * np.prod(weights) <= read
-        assert all(16 * n * np.prod(weights) > read for n in larger)
-    assert convolution._groups((8, 17, 17, 256), (256, 256)) == 1
+def test_a_gpu_has_kernels_for_bfloat16_and_few_channels(rng, monkeypatch):
+    """Lets the GPU's kernels be interpreted, and tells them from blocks, which know any type and number of channels."""
+    calls = []
+    interpreted = functools.partial(task_convolution.convolve_directly, interpret=True)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(task_convolution, "convolve_directly", lambda *args: calls.append(args) or interpreted(*args))
+    for dtype, channels, kernels in ((jnp.bfloat16, 4, 1), (jnp.bfloat16, 65, 0), (jnp.float32, 4, 0)):
+        x, kernel = (jnp.asarray(rng.random(shape), dtype) for shape in ((1, 5, 6, channels), (3, 3, channels, 2)))
+        found = convolution.conv2d(x, kernel, 2).astype(float)
+        np.testing.assert_allclose(found, reference_conv2d(x.astype(float), kernel.astype(float), 2), rtol=2**-7)
+        assert len(calls) == kernels
+        calls.clear()

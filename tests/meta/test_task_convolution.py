@@ -6,14 +6,15 @@ import numpy as np
 import pytest
 from lax_convolution import all_derivatives, assert_agree, reference_conv2d
 
-from milx.meta import kernels
+from milx.meta import kernels, task_convolution
 from milx.meta.task_convolution import convolve_directly
 
 # Images, height, width, channels, filters, kernel and stride.
 SHAPES = {
     "three channels": (2, 9, 11, 3, 5, 5, 2),
     "rows of several pieces": (1, 6, 7, 16, 4, 5, 3),
-    "several programs": (2, 14, 15, 4, 3, 3, 1),
+    "many filters": (1, 5, 6, 8, 33, 3, 2),
+    "several images at once, and a rest": (5, 3, 4, 4, 3, 3, 1),
     "a single pixel": (2, 5, 4, 4, 3, 1, 1),
     "pixels that no window covers": (2, 7, 8, 2, 3, 2, 3),
 }
@@ -23,14 +24,26 @@ def directly(x, kernel, stride):
     return convolve_directly(x, kernel, stride, interpret=True)
 
 
-@pytest.mark.parametrize("shape", SHAPES)
-def test_value_and_derivatives_are_those_of_lax(rng, monkeypatch, shape):
-    images, height, width, channels, filters, taps, stride = SHAPES[shape]
-    monkeypatch.setattr(kernels, "_PROGRAMS", 2 * taps)  # two of them sum, in several steps if there are 420 outputs
+def agree_with_lax(rng, shape):
+    images, height, width, channels, filters, taps, stride = shape
     sizes = ((images, height, width, channels), (taps, taps, channels, filters))
     inputs, directions = (tuple(jnp.asarray(rng.standard_normal(size)) for size in sizes) for _ in range(2))
     found, expected = (all_derivatives(conv, inputs, directions, stride) for conv in (directly, reference_conv2d))
     assert_agree(found, expected, 1e-12)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_value_and_derivatives_are_those_of_lax(rng, shape):
+    agree_with_lax(rng, SHAPES[shape])
+
+
+@pytest.mark.parametrize("name", ["_KEPT", "_SUMS"])
+def test_what_programs_do_not_keep_they_read_again_or_share(rng, monkeypatch, name):
+    """Lets no weights be kept, or a program have the sums for a single row of windows."""
+    monkeypatch.setattr(kernels, name, 0)
+    jax.clear_caches()
+    agree_with_lax(rng, (4, 8, 9, 5, 6, 3, 2))
+    jax.clear_caches()
 
 
 @pytest.mark.parametrize(
@@ -65,15 +78,26 @@ def test_products_of_bfloat16_are_summed_in_float32(rng):
     np.testing.assert_allclose(gradient(directly, x, kernel).astype(float), expected, rtol=2**-8)
 
 
+def test_more_numbers_than_32_bits_count_are_computed_task_by_task(rng, monkeypatch):
+    x, kernel = (jnp.asarray(rng.standard_normal(shape)) for shape in ((3, 2, 5, 6, 4), (3, 3, 3, 4, 3)))
+
+    def gradient(conv):
+        return jax.grad(lambda inputs: jnp.sum(jax.vmap(lambda *pair: conv(*pair, 2))(*inputs) ** 3))((x, kernel))
+
+    monkeypatch.setattr(task_convolution, "MOST_NUMBERS", 2 * 5 * 6 * 4 + 10)
+    assert "scan" in str(jax.make_jaxpr(lambda: gradient(directly))())
+    assert_agree(gradient(directly), gradient(reference_conv2d), 1e-12)
+
+
 @pytest.mark.parametrize(
-    ("tasks", "channels", "filters", "message"),
+    ("images", "channels", "message"),
     [
-        (2**14, 8, 8, "convolve: got an array of 4294967296 numbers, expected at most 2147418112"),
-        (1, 4, 129, "filters or channels: got 129, expected at most 128"),
+        (2**15, 8, "convolve: got an array of 4294967296 numbers, expected at most 2147418112"),
+        (1, 65, "filters or channels: got 65, expected at most 64"),
     ],
 )
-def test_sizes_that_the_kernels_cannot_have_are_refused(tasks, channels, filters, message):
-    x = jax.ShapeDtypeStruct((tasks, 2, 128, 128, channels), jnp.float32)
-    kernel = jax.ShapeDtypeStruct((3, 3, channels, filters), jnp.float32)
+def test_sizes_that_the_kernels_cannot_have_are_refused(images, channels, message):
+    x = jax.ShapeDtypeStruct((images, 128, 128, channels), jnp.float32)
+    kernel = jax.ShapeDtypeStruct((3, 3, channels, 8), jnp.float32)
     with pytest.raises(ValueError, match=message):
-        jax.eval_shape(jax.vmap(lambda x, kernel: directly(x, kernel, 2), (0, None)), x, kernel)
+        jax.eval_shape(lambda x, kernel: directly(x, kernel, 2), x, kernel)
