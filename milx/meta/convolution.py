@@ -20,7 +20,7 @@ def same_padding(size: int, kernel: int, stride: int) -> tuple[int, int]:
 def conv2d(x: jax.Array, kernel: jax.Array, stride: int) -> jax.Array:
     """Convolves in two dimensions with SAME padding: on a CPU by patches, on accelerators by blocks.
 
-    A GPU has kernels of its own for bfloat16 and at most 64 channels and filters.
+    A GPU has kernels of its own for some sizes (`has_kernels`).
 
     Args:
         x: [B, H, W, C].
@@ -30,13 +30,18 @@ def conv2d(x: jax.Array, kernel: jax.Array, stride: int) -> jax.Array:
     Returns:
         [B, ceil(H / stride), ceil(W / stride), F].
     """
-    if jax.default_backend() == "cpu":
-        return convolve_patches(x, kernel, stride)
-    if jax.default_backend() == "gpu" and jnp.result_type(x, kernel) == jnp.bfloat16 and max(kernel.shape) <= 64:
+    if has_kernels(x, kernel):
         from milx.meta.task_convolution import convolve_directly  # Pallas takes a quarter of a second to import
 
         return convolve_directly(x, kernel, stride)
-    return convolve_blocks(x, kernel, stride)
+    by = convolve_patches if jax.default_backend() == "cpu" else convolve_blocks
+    return by(x, kernel, stride)
+
+
+def has_kernels(x: jax.Array, kernel: jax.Array) -> bool:
+    """Tells whether `conv2d` convolves by a GPU's own kernels: in bfloat16, up to 64 channels and filters."""
+    few = max(kernel.shape[2:]) <= 64
+    return jax.default_backend() == "gpu" and jnp.result_type(x, kernel) == jnp.bfloat16 and few
 
 
 def convolve_patches(x: jax.Array, kernel: jax.Array, stride: int) -> jax.Array:

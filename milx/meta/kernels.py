@@ -17,7 +17,7 @@ multiplied as the GPU does by default, which is TF32.
 import functools
 import itertools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -44,69 +44,78 @@ _MULTIPLYING, _SUMMING = 1056, 264
 """Programs to start at least: eight, or two, for each multiprocessor of an H200."""
 
 
-def convolve(x: jax.Array, kernel: jax.Array, *, geometry: Geometry, interpret: bool = False) -> jax.Array:
-    """Computes y, [T, B, P, Q, F], of x, [T, B, H, W, C], and W, [T, k, k, C, F], or [1, k, k, C, F] for all tasks."""
-    channels, filters = kernel.shape[3:]
+def convolve(*pairs: jax.Array, geometry: Geometry, interpret: bool = False) -> jax.Array:
+    """Computes y, [T, B, P, Q, F], of x, [T, B, H, W, C], and W, [T, k, k, C, F], or [1, k, k, C, F] for all tasks.
+
+    Of further pairs x and W the results are added, before they are rounded. It is the same for the other two.
+    """
+    channels, filters = pairs[1].shape[3:]
     wide = 2 if filters <= 32 else 1
-    one, two = (of_outputs(geometry, channels, filters, (rows, wide), x.dtype.itemsize) for rows in (1, 2))
-    tiles = two if channels > 4 and _kept(two, geometry.taps, x.dtype) else one
-    return _multiply(x, kernel, tiles, (filters, 1), "convolve", interpret)
+    one, two = (of_outputs(geometry, channels, filters, (rows, wide), pairs[0].dtype.itemsize) for rows in (1, 2))
+    tiles = two if channels > 4 and _keeps(two, geometry.taps, pairs) else one
+    return _multiply(pairs, geometry.taps, tiles, (filters, 1), "convolve", interpret)
 
 
-def to_input(dy: jax.Array, kernel: jax.Array, *, geometry: Geometry, interpret: bool = False) -> jax.Array:
+def to_input(*pairs: jax.Array, geometry: Geometry, interpret: bool = False) -> jax.Array:
     """Computes the transpose in x, [T, B, H, W, C], of dy, [T, B, P, Q, F], by W, which is as in `convolve`."""
-    channels, filters = kernel.shape[3:]
-    return _multiply(dy, kernel, of_inputs(geometry, channels, filters), (1, filters), "to_input", interpret)
+    channels, filters = pairs[1].shape[3:]
+    tiles = of_inputs(geometry, channels, filters)
+    return _multiply(pairs, geometry.taps, tiles, (1, filters), "to_input", interpret)
 
 
-def to_kernel(x: jax.Array, dy: jax.Array, *, geometry: Geometry, interpret: bool = False) -> jax.Array:
-    """Computes the transpose in W, [T, k, k, C, F], of dy, [T, B, P, Q, F], by x, [T, B, H, W, C].
+def to_kernel(*pairs: jax.Array, geometry: Geometry, interpret: bool = False) -> jax.Array:
+    """Computes the transpose in W, [T, k, k, C, F], of dy, [T, B, P, Q, F], by x, [T, B, H, W, C]: pairs are x and dy.
 
     Programs sum over some of the pixels each, and their sums are added.
     """
     stride, taps = geometry.stride, geometry.taps
-    channels, filters = x.shape[-1], dy.shape[-1]
-    tiles = of_outputs(geometry, channels, filters, (1, 2 if filters <= 16 else 1), x.dtype.itemsize)
-    sums = _sum_products(x, dy, tiles, interpret)
+    channels, filters = pairs[0].shape[-1], pairs[1].shape[-1]
+    tiles = of_outputs(geometry, channels, filters, (1, 2 if filters <= 16 else 1), pairs[0].dtype.itemsize)
+    sums = _sum_products(pairs, tiles, interpret)
     pixels = (sums[:, :, stride * j : stride * j + taps, :, j] for j in range(tiles.tile[1]))
-    return functools.reduce(jnp.add, pixels).astype(x.dtype)
+    return functools.reduce(jnp.add, pixels).astype(pairs[0].dtype)
 
 
-def _multiply(x: jax.Array, kernel: jax.Array, tiles: Tiles, strides: Pair, name: str, interpret: bool) -> jax.Array:
+def _multiply(
+    pairs: Sequence[jax.Array], taps: int, tiles: Tiles, strides: Pair, name: str, interpret: bool
+) -> jax.Array:
     """Multiplies windows by weights: [T, B, rows, columns, channels] that are written.
 
     Args:
-        x: [T, B, ...], the images that are read.
-        kernel: [T, k, k, C, F] or [1, k, k, C, F].
+        pairs: images that are read, [T, B, ...], and kernels, [T, k, k, C, F] or [1, k, k, C, F].
+        taps: k.
         tiles: what is computed.
         strides: from a channel that is read, and from one that is written, to the next in the kernel's memory.
         name: of the operation.
         interpret: run on any device, slowly, for tests.
     """
-    (tasks, images), (shared, taps) = x.shape[:2], kernel.shape[:2]
-    columns, pieces, pairs = _columns(tiles), list(_pieces(tiles, x.dtype)), _pairs(tiles, taps)
-    kept, sums = _kept(tiles, taps, x.dtype), tiles.tile[0] * columns
-    at = places(tiles, images, _BYTES // x.dtype.itemsize, tasks, _MULTIPLYING)
+    (tasks, images), dtype = pairs[0].shape[:2], pairs[0].dtype
+    columns, pieces, meetings = _columns(tiles), list(_pieces(tiles, dtype)), _meetings(tiles, taps)
+    keeps, sums = _keeps(tiles, taps, pairs), tiles.tile[0] * columns
+    at = places(tiles, images, _BYTES // dtype.itemsize, tasks, _MULTIPLYING)
+    shared = [len(kernel) < tasks for kernel in pairs[1::2]]
+    parts = list(itertools.product(range(len(shared)), dict(meetings), pieces))
 
-    def program(x, kernel, y):
-        place, chunk, task = (pl.program_id(axis) for axis in range(3))
+    def program(*references):
+        (*read, y), (place, chunk, task) = references, (pl.program_id(axis) for axis in range(3))
         spot = _spot(at, place)
 
-        def load(row: int, pixel: int, piece: Pair) -> jax.Array:
+        def load(pair: int, row: int, pixel: int, piece: Pair) -> jax.Array:
             where, inside = _of_weights(tiles, taps, row, pixel, piece, strides)
-            return _load(kernel.at[task if shared > 1 else 0, where], inside)
+            return _load(read[2 * pair + 1].at[0 if shared[pair] else task, where], inside)
 
-        weights = {(*pair, piece): load(*pair, piece) for pair in pairs for piece in pieces} if kept else {}
+        every = [(pair, *meeting, piece) for pair, row, piece in parts for meeting in meetings if meeting[0] == row]
+        weights = {each: load(*each) for each in every if keeps}
 
         def step(number, carried):
             number += chunk * at.steps
-            totals = [jnp.zeros((len(spot.row), columns), _wide(x.dtype)) for _ in range(tiles.tile[0])]
-            for row, piece in itertools.product(dict(pairs), pieces):
+            totals = [jnp.zeros((len(spot.row), columns), _wide(dtype)) for _ in range(tiles.tile[0])]
+            for pair, row, piece in parts:
                 where, inside = _at_step(_of_windows(tiles, spot, row, piece), tiles.read, at, spot, number, images)
-                windows = _load(x.at[task, where], inside)
-                for pixel in (pixel for other, pixel in pairs if other == row):
-                    right = weights[row, pixel, piece] if kept else load(row, pixel, piece)
-                    totals[pixel] += _product(windows, right, 1)
+                windows = _load(read[2 * pair].at[task, where], inside)
+                for pixel in (pixel for other, pixel in meetings if other == row):
+                    each = pair, row, pixel, piece
+                    totals[pixel] += _product(windows, weights[each] if keeps else load(*each), 1)
             for pixel, total in enumerate(totals):
                 where, inside = _at_step(_of_tiles(tiles, spot, pixel), tiles.written, at, spot, number, images)
                 _store(y.at[task, where], total, inside)
@@ -116,37 +125,39 @@ def _multiply(x: jax.Array, kernel: jax.Array, tiles: Tiles, strides: Pair, name
 
     grid = math.prod(at.grid), at.chunks, tasks
     shape = tasks, images * math.prod(tiles.written)
-    call = _call(program, shape, x.dtype, grid, name, 4 if sums <= 128 else 8, 1, interpret)
-    return call(x.reshape(tasks, -1), kernel.reshape(shared, -1)).reshape(tasks, images, *tiles.written)
+    call = _call(program, shape, dtype, grid, name, 4 if sums <= 128 else 8, 1, interpret)
+    return call(*(array.reshape(len(array), -1) for array in pairs)).reshape(tasks, images, *tiles.written)
 
 
-def _sum_products(x: jax.Array, dy: jax.Array, tiles: Tiles, interpret: bool) -> jax.Array:
+def _sum_products(pairs: Sequence[jax.Array], tiles: Tiles, interpret: bool) -> jax.Array:
     """Sums the products of windows and tiles of one row, u' outputs: [T, rows and columns of a window, C, u', F]."""
-    tasks, images = x.shape[:2]
-    columns, pieces = _columns(tiles), list(_pieces(tiles, x.dtype))
+    (tasks, images), dtype = pairs[0].shape[:2], pairs[0].dtype
+    columns, pieces = _columns(tiles), list(_pieces(tiles, dtype))
     (rows, length), channels = tiles.window, tiles.read[2]
     sums = rows * columns * sum(width for _, width in pieces)
     alone = sums <= _SUMS  # a program keeps the sums for all rows of a window
     others = tasks if alone else tasks * rows
     count = 64 if not alone or sums <= _SUMS // 2 else 32
-    at = places(tiles, images, max(_LEAST, count * 2 // x.dtype.itemsize), others, _SUMMING)
+    at = places(tiles, images, max(_LEAST, count * 2 // dtype.itemsize), others, _SUMMING)
 
-    def program(x, dy, found):
-        place, chunk, task = (pl.program_id(axis) for axis in range(3))
+    def program(*references):
+        (*read, found), (place, chunk, task) = references, (pl.program_id(axis) for axis in range(3))
         mine = list(range(rows)) if alone else [place % rows]
         place = place if alone else place // rows
         spot, n = _spot(at, place), _numbers(columns)
 
         def step(number, totals):
             number += chunk * at.steps
-            where, inside = _at_step(_of_tiles(tiles, spot, 0), tiles.written, at, spot, number, images)
-            given, more = _load(dy.at[task, where], inside), []
-            for total, (row, piece) in zip(totals, itertools.product(mine, pieces), strict=True):
-                where, inside = _at_step(_of_windows(tiles, spot, row, piece), tiles.read, at, spot, number, images)
-                more.append(total + _product(_load(x.at[task, where], inside), given, 0))
-            return tuple(more)
+            for x, dy in zip(read[::2], read[1::2], strict=True):
+                where, inside = _at_step(_of_tiles(tiles, spot, 0), tiles.written, at, spot, number, images)
+                given, more = _load(dy.at[task, where], inside), []
+                for total, (row, piece) in zip(totals, itertools.product(mine, pieces), strict=True):
+                    where, inside = _at_step(_of_windows(tiles, spot, row, piece), tiles.read, at, spot, number, images)
+                    more.append(total + _product(_load(x.at[task, where], inside), given, 0))
+                totals = tuple(more)
+            return totals
 
-        start = tuple(jnp.zeros((width, columns), _wide(x.dtype)) for _ in mine for _, width in pieces)
+        start = tuple(jnp.zeros((width, columns), _wide(dtype)) for _ in mine for _, width in pieces)
         totals = lax.fori_loop(0, at.steps, step, start)
         for (row, (first, width)), total in zip(itertools.product(mine, pieces), totals, strict=True):
             r = _numbers(width)[:, None] + first
@@ -156,8 +167,8 @@ def _sum_products(x: jax.Array, dy: jax.Array, tiles: Tiles, interpret: bool) ->
     parts = math.prod(at.grid) * at.chunks
     shape = parts, tasks, rows, length * channels, tiles.tile[1] * tiles.written[2]
     grid = math.prod(at.grid) * (1 if alone else rows), at.chunks, tasks
-    call = _call(program, shape, _wide(x.dtype), grid, "to_kernel", *((2, 1) if alone else (4, 3)), interpret)
-    total = call(x.reshape(tasks, -1), dy.reshape(tasks, -1)).sum(axis=0)
+    call = _call(program, shape, _wide(dtype), grid, "to_kernel", *((2, 1) if alone else (4, 3)), interpret)
+    total = call(*(array.reshape(tasks, -1) for array in pairs)).sum(axis=0)
     return total.reshape(tasks, rows, length, channels, tiles.tile[1], tiles.written[2])
 
 
@@ -212,7 +223,7 @@ def _at_step(where: tuple, size: tuple[int, int, int], at: Places, spot: _Spot, 
     return step * (at.images * math.prod(size)) + numbers, inside
 
 
-def _pairs(tiles: Tiles, taps: int) -> list[Pair]:
+def _meetings(tiles: Tiles, taps: int) -> list[Pair]:
     """Lists the rows of windows and of tiles that meet at a tap of the kernel, by the first."""
     rows = itertools.product(range(tiles.window[0]), range(tiles.tile[0]))
     return [(row, pixel) for row, pixel in rows if 0 <= tiles.taps[0].at(row, pixel) < taps]
@@ -230,10 +241,11 @@ def _of_weights(
     return where + r % read * strides[0] + n % written * strides[1], inside
 
 
-def _kept(tiles: Tiles, taps: int, dtype: Any) -> bool:
-    """Tells whether a program keeps all weights."""
-    width = sum(width for _, width in _pieces(tiles, dtype))
-    return len(_pairs(tiles, taps)) * width * _columns(tiles) * jnp.dtype(dtype).itemsize <= _KEPT
+def _keeps(tiles: Tiles, taps: int, pairs: Sequence[jax.Array]) -> bool:
+    """Tells whether a program keeps the weights of all pairs."""
+    width = sum(width for _, width in _pieces(tiles, pairs[0].dtype))
+    numbers = len(_meetings(tiles, taps)) * width * _columns(tiles) * len(pairs[::2])
+    return numbers * pairs[0].dtype.itemsize <= _KEPT
 
 
 def _pieces(tiles: Tiles, dtype: Any) -> Iterator[Pair]:

@@ -6,7 +6,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from milx.meta.convolution import conv2d
+from milx.meta.convolution import conv2d, has_kernels, same_padding
 
 
 def positions(height: int, width: int) -> jax.Array:
@@ -91,6 +91,28 @@ def _shifted_relu_backward(dtype: jnp.dtype, kept: tuple, gradient: jax.Array) -
 shifted_relu.defvjp(_shifted_relu_forward, _shifted_relu_backward)
 
 
+def with_bias(x: jax.Array, kernel: jax.Array, bias: jax.Array, stride: int) -> tuple[jax.Array, jax.Array]:
+    """Makes a convolution's bias the weight of one more channel, which is one in every pixel.
+
+    It has this weight at the tap that sees a pixel of the image for every output, and none at the others.
+
+    Args:
+        x: [B, H, W, C].
+        kernel: [k, k, C, F].
+        bias: [F].
+        stride: the same in both directions.
+
+    Returns:
+        [B, H, W, C + 1] and [k, k, C + 1, F], in the types of x and of the kernel.
+    """
+    taps = kernel.shape[0]
+    sees = [same_padding(size, taps, stride)[0] for size in x.shape[1:3]]
+    at = [(tap, taps - 1 - tap) for tap in sees]
+    weights = jnp.pad(bias.astype(kernel.dtype)[None, None, None], (*at, (0, 0), (0, 0)))
+    ones = jnp.pad(x, ((0, 0), (0, 0), (0, 0), (0, 1)), constant_values=1)
+    return ones, jnp.concatenate([kernel, weights], axis=2)
+
+
 def _sum_over_pixels(x: jax.Array, dtype: jnp.dtype) -> jax.Array:
     """Sums [B, .., F] to [F]."""
     if jax.default_backend() != "gpu":
@@ -145,8 +167,12 @@ class ConvBlock(nn.Module):
         bias = self.param("bias", nn.initializers.zeros, (self.filters,))
         center = self.param("centre", nn.initializers.zeros, (self.filters,))
         dtype = jnp.bfloat16 if self.mixed_precision else kernel.dtype
-        x = conv2d(x.astype(dtype), kernel.astype(dtype), self.stride)
-        x = layer_norm(add_bias(x, bias))
+        x, kernel = x.astype(dtype), kernel.astype(dtype)
+        if has_kernels(x, kernel) and x.shape[-1] == 3:  # they read a fourth channel anyway
+            x = conv2d(*with_bias(x, kernel, bias, self.stride), self.stride).astype(bias.dtype)
+        else:
+            x = add_bias(conv2d(x, kernel, self.stride), bias)
+        x = layer_norm(x)
         return shifted_relu(x if skip is None else x + skip, center, dtype)
 
 

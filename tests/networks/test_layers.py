@@ -162,3 +162,27 @@ def test_gradients_of_bfloat16_images_are_summed_in_float32(shape):
     np.testing.assert_allclose(bias, expected, rtol=1e-6)
     center = jax.grad(lambda center: (weight * layers.shifted_relu(x, center, jnp.bfloat16).astype(float)).sum())
     np.testing.assert_allclose(center(jnp.zeros(3)), expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("kernel", "stride"), [(5, 2), (3, 1), (1, 2), (2, 3)])
+def test_a_bias_as_a_channel_is_added_once(rng, kernel, stride):
+    """Compares the convolution of one more channel, and its derivatives, with a bias that is added."""
+    shapes = (2, 7, 9, 3), (kernel, kernel, 3, 4), (4,)
+    inputs, directions = (tuple(jnp.asarray(rng.standard_normal(shape)) for shape in shapes) for _ in range(2))
+    axes = ("NHWC", "HWIO", "NHWC")
+
+    def convolve(x, kernel):
+        return jax.lax.conv_general_dilated(x, kernel, (stride, stride), "SAME", dimension_numbers=axes)
+
+    def added(x, kernel, bias):
+        return convolve(x, kernel) + bias
+
+    def channel(*inputs):
+        return convolve(*layers.with_bias(*inputs, stride))
+
+    def derivatives(convolution):
+        gradient = jax.grad(lambda inputs: jnp.sum(convolution(*inputs) ** 3))
+        return convolution(*inputs), jax.jvp(gradient, (inputs,), (directions,))
+
+    agree = lambda found, expected: np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-9)  # noqa: E731
+    jax.tree.map(agree, derivatives(channel), derivatives(added))
