@@ -48,7 +48,7 @@ def meta_gradient(
 
     def of_group(tasks: Any) -> tuple[Any, tuple[jax.Array, Any]]:
         def mean_loss(params: Any) -> tuple[jax.Array, tuple[jax.Array, Any]]:
-            found = jax.vmap(task_loss, in_axes=(None, 0))(params, tasks)
+            found = jax.vmap(task_loss)(repeat(params, _count(tasks)), tasks)
             if has_aux and not (isinstance(found, tuple) and len(found) == 2):
                 raise ValueError("task_loss: got no pair, expected one with has_aux")
             losses, aux = found if has_aux else (found, None)
@@ -73,6 +73,15 @@ def meta_gradient(
     mean = jax.tree.map(lambda x, p: (x / len(found[0])).astype(p.dtype), total, params)
     found = jax.tree.map(lambda x: x.reshape(count, *x.shape[2:]), found)
     return mean, found if has_aux else found[0]
+
+
+def repeat(params: Any, count: int) -> Any:
+    """Gives every task its own copy of the parameters, with a leading axis.
+
+    Then all gradients by one parameter are added for each task before they are summed over the tasks, once. Where tasks
+    share the parameters, each of these gradients is summed over them on its own.
+    """
+    return jax.tree.map(lambda p: jnp.broadcast_to(p, (count, *jnp.shape(p))), params)
 
 
 def tasks_within(

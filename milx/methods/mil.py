@@ -21,6 +21,7 @@ import jax.numpy as jnp
 
 from milx import meta
 from milx.config.schema import GIVEN, Config, MethodConfig, number
+from milx.meta.objective import repeat
 from milx.methods.base import Method
 from milx.methods.imitation import (
     behavioral_cloning,
@@ -163,7 +164,7 @@ class MIL(Method):
         A hindsight head learns from the queries beside it, unadapted, as the inner step uses it.
         """
 
-        def task_loss(support: Demo, query: Demo) -> tuple[jax.Array, dict[str, jax.Array]]:
+        def task_loss(params: Params, support: Demo, query: Demo) -> tuple[jax.Array, dict[str, jax.Array]]:
             if self.config.variant != "multi_step":
                 return self._query_loss(params, self._steps(params, support), query)
             thetas = self._steps(params, support, path=True)
@@ -174,7 +175,7 @@ class MIL(Method):
             loss = meta.multi_step_loss(jnp.stack([loss for loss, _ in found]), progress)
             return loss, found[-1][1]
 
-        loss, metrics = jax.vmap(task_loss)(batch.support, batch.query)
+        loss, metrics = jax.vmap(task_loss)(repeat(params, len(batch.query.action)), batch.support, batch.query)
         return loss.mean(), {"loss": loss, **metrics}
 
     def imitation(self, params: Params, batch: TaskBatch) -> tuple[jax.Array, dict[str, jax.Array]]:
