@@ -19,6 +19,7 @@ from milx.core import files
 from milx.data.goals import with_goals
 from milx.deploy import standalone
 from milx.deploy.policy import Policy
+from milx.meta.operations import portable
 from milx.types import Demo, Observation, Params, Spec, by_field, from_fields, is_image
 
 PLATFORMS = ("cpu", "cuda")
@@ -114,4 +115,5 @@ def _dtype(field: str) -> Any:
 
 def _program(function: Any, *args: Any) -> bytes:
     shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), args)
-    return bytes(jax_export.export(jax.jit(function), platforms=PLATFORMS)(*shapes).serialize())
+    with portable():
+        return bytes(jax_export.export(jax.jit(function), platforms=PLATFORMS)(*shapes).serialize())

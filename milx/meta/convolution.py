@@ -6,9 +6,13 @@ becomes a batched matrix product.
 """
 
 import functools
+import math
 
 import jax
 import jax.numpy as jnp
+
+MOST_CHANNELS = 64
+"""Most channels and filters of the Pallas kernels, whose programs keep sums for all of them."""
 
 
 def same_padding(size: int, kernel: int, stride: int) -> tuple[int, int]:
@@ -18,9 +22,9 @@ def same_padding(size: int, kernel: int, stride: int) -> tuple[int, int]:
 
 
 def conv2d(x: jax.Array, kernel: jax.Array, stride: int) -> jax.Array:
-    """Convolves in two dimensions with SAME padding: on a CPU by patches, on accelerators by blocks.
+    """Convolves in two dimensions with SAME padding.
 
-    A GPU has kernels of its own for some sizes (`has_kernels`).
+    By patches on a CPU, by Pallas kernels on a GPU in bfloat16 with up to 64 channels and filters, and else by blocks.
 
     Args:
         x: [B, H, W, C].
@@ -39,8 +43,8 @@ def conv2d(x: jax.Array, kernel: jax.Array, stride: int) -> jax.Array:
 
 
 def has_kernels(x: jax.Array, kernel: jax.Array) -> bool:
-    """Tells whether `conv2d` convolves by a GPU's own kernels: in bfloat16, up to 64 channels and filters."""
-    few = max(kernel.shape[2:]) <= 64
+    """Tells whether `conv2d` convolves by Pallas kernels: on a GPU, in bfloat16, and for sizes that they can have."""
+    few = max(kernel.shape[2:]) <= MOST_CHANNELS and math.prod(x.shape[:3]) * max(*kernel.shape[2:], 4) < 2**30
     return jax.default_backend() == "gpu" and jnp.result_type(x, kernel) == jnp.bfloat16 and few
 
 

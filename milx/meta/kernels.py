@@ -26,28 +26,27 @@ from jax import lax
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton
 
-from milx.meta.operations import MOST_NUMBERS
+from milx.meta.convolution import MOST_CHANNELS
+from milx.meta.operations import PROGRAMS, check_numbers
 from milx.meta.tiles import Geometry, Pair, Places, Tiles, of_inputs, of_outputs, places
 
-MOST_CHANNELS = 64
-"""Most filters, and channels of images: a program keeps sums for all of them."""
 # The numbers below were chosen by timing push's and reach's layers on an H200, in bfloat16.
 _LEAST = 16
 """Least side of the matrices that are multiplied."""
 _BYTES = 256
-"""Most bytes in a row of the left matrix, and of a column."""
+"""Most bytes of a row of windows that are multiplied at once, and of one number of all windows."""
 _KEPT = 96 * 1024
 """Most bytes of weights that a program keeps; it reads more of them anew for every image."""
 _SUMS = 8192
 """Most sums for all rows of a window that a program keeps; more are shared by a program for each row."""
-_MULTIPLYING, _SUMMING = 1056, 264
-"""Programs to start at least: eight, or two, for each multiprocessor of an H200."""
+_SUMMING = PROGRAMS // 4
+"""Programs to start at least if each writes sums, which are added."""
 
 
 def convolve(*pairs: jax.Array, geometry: Geometry, interpret: bool = False) -> jax.Array:
     """Computes y, [T, B, P, Q, F], of x, [T, B, H, W, C], and W, [T, k, k, C, F], or [1, k, k, C, F] for all tasks.
 
-    Of further pairs x and W the results are added, before they are rounded. It is the same for the other two.
+    With more pairs x and W their results are added before they are rounded; so are those of `to_input` and `to_kernel`.
     """
     channels, filters = pairs[1].shape[3:]
     wide = 2 if filters <= 32 else 1
@@ -92,9 +91,9 @@ def _multiply(
     (tasks, images), dtype = pairs[0].shape[:2], pairs[0].dtype
     columns, pieces, meetings = _columns(tiles), list(_pieces(tiles, dtype)), _meetings(tiles, taps)
     keeps, sums = _keeps(tiles, taps, pairs), tiles.tile[0] * columns
-    at = places(tiles, images, _BYTES // dtype.itemsize, tasks, _MULTIPLYING)
+    at = places(tiles, images, _BYTES // dtype.itemsize, tasks, PROGRAMS)
     shared = [len(kernel) < tasks for kernel in pairs[1::2]]
-    parts = list(itertools.product(range(len(shared)), dict(meetings), pieces))
+    parts = list(itertools.product(range(len(shared)), sorted({row for row, _ in meetings}), pieces))
 
     def program(*references):
         (*read, y), (place, chunk, task) = references, (pl.program_id(axis) for axis in range(3))
@@ -139,14 +138,16 @@ def _sum_products(pairs: Sequence[jax.Array], tiles: Tiles, interpret: bool) -> 
     others = tasks if alone else tasks * rows
     count = 64 if not alone or sums <= _SUMS // 2 else 32
     at = places(tiles, images, max(_LEAST, count * 2 // dtype.itemsize), others, _SUMMING)
+    there = math.prod(at.grid)
+    each = max(1, there * at.chunks * others // PROGRAMS)  # places of a program, so that few sums are left to add
+    programs = pl.cdiv(there, each)
 
     def program(*references):
-        (*read, found), (place, chunk, task) = references, (pl.program_id(axis) for axis in range(3))
-        mine = list(range(rows)) if alone else [place % rows]
-        place = place if alone else place // rows
-        spot, n = _spot(at, place), _numbers(columns)
+        (*read, found), (group, chunk, task) = references, (pl.program_id(axis) for axis in range(3))
+        mine = list(range(rows)) if alone else [group % rows]
+        group, n = group if alone else group // rows, _numbers(columns)
 
-        def step(number, totals):
+        def step(number, totals, spot):
             number += chunk * at.steps
             for x, dy in zip(read[::2], read[1::2], strict=True):
                 where, inside = _at_step(_of_tiles(tiles, spot, 0), tiles.written, at, spot, number, images)
@@ -157,16 +158,19 @@ def _sum_products(pairs: Sequence[jax.Array], tiles: Tiles, interpret: bool) -> 
                 totals = tuple(more)
             return totals
 
+        def at_place(number, totals):
+            step_there = functools.partial(step, spot=_spot(at, group * each + number))
+            return lax.fori_loop(0, at.steps, step_there, totals)
+
         start = tuple(jnp.zeros((width, columns), _wide(dtype)) for _ in mine for _, width in pieces)
-        totals = lax.fori_loop(0, at.steps, step, start)
+        totals = lax.fori_loop(0, each, at_place, start)
         for (row, (first, width)), total in zip(itertools.product(mine, pieces), totals, strict=True):
             r = _numbers(width)[:, None] + first
             inside = (r < length * channels) & (n < tiles.tile[1] * tiles.written[2])[None]
-            _store(found.at[place * at.chunks + chunk, task, row, r, n[None]], total, inside)
+            _store(found.at[group * at.chunks + chunk, task, row, r, n[None]], total, inside)
 
-    parts = math.prod(at.grid) * at.chunks
-    shape = parts, tasks, rows, length * channels, tiles.tile[1] * tiles.written[2]
-    grid = math.prod(at.grid) * (1 if alone else rows), at.chunks, tasks
+    shape = programs * at.chunks, tasks, rows, length * channels, tiles.tile[1] * tiles.written[2]
+    grid = programs * (1 if alone else rows), at.chunks, tasks
     call = _call(program, shape, _wide(dtype), grid, "to_kernel", *((2, 1) if alone else (4, 3)), interpret)
     total = call(*(array.reshape(tasks, -1) for array in pairs)).sum(axis=0)
     return total.reshape(tasks, rows, length, channels, tiles.tile[1], tiles.written[2])
@@ -216,9 +220,9 @@ def _of_tiles(tiles: Tiles, spot: _Spot, pixel: int) -> tuple[jax.Array, jax.Arr
 
 
 def _at_step(where: tuple, size: tuple[int, int, int], at: Places, spot: _Spot, step: Any, images: int) -> tuple:
-    """Moves on to the images, of a size, of a step; the last step may have fewer of them."""
+    """Moves on to the images, of a size, of a step; the last steps may have fewer of them, or none."""
     numbers, inside = where
-    if images % at.images:
+    if at.images * at.steps * at.chunks > images:
         inside &= (step * at.images + spot.image < images)[:, None]
     return step * (at.images * math.prod(size)) + numbers, inside
 
@@ -226,7 +230,7 @@ def _at_step(where: tuple, size: tuple[int, int, int], at: Places, spot: _Spot, 
 def _meetings(tiles: Tiles, taps: int) -> list[Pair]:
     """Lists the rows of windows and of tiles that meet at a tap of the kernel, by the first."""
     rows = itertools.product(range(tiles.window[0]), range(tiles.tile[0]))
-    return [(row, pixel) for row, pixel in rows if 0 <= tiles.taps[0].at(row, pixel) < taps]
+    return [(row, pixel) for row, pixel in rows if 0 <= tiles.lines[0].at(row, pixel) < taps]
 
 
 def _of_weights(
@@ -235,9 +239,9 @@ def _of_weights(
     """Finds the weights of a piece of a row of windows, and of a row of tiles: [width, columns], as `_of_windows`."""
     (_, _, read), (_, _, written) = tiles.read, tiles.written
     r, n = _numbers(piece[1])[:, None] + piece[0], _numbers(_columns(tiles))[None]
-    tap = tiles.taps[1].at(r // read, n // written)
+    tap = tiles.lines[1].at(r // read, n // written)
     inside = (tap >= 0) & (tap < taps) & (r < tiles.window[1] * read) & (n < tiles.tile[1] * written)
-    where = (tiles.taps[0].at(row, pixel) * taps + tap) * (read * written)
+    where = (tiles.lines[0].at(row, pixel) * taps + tap) * (read * written)
     return where + r % read * strides[0] + n % written * strides[1], inside
 
 
@@ -318,9 +322,7 @@ def _call(
     )
 
     def run(*arrays: jax.Array) -> jax.Array:
-        for numbers in (math.prod(shape), *(array.size for array in arrays)):
-            if numbers > MOST_NUMBERS:
-                raise ValueError(f"{name}: got an array of {numbers} numbers, expected at most {MOST_NUMBERS}")
+        check_numbers(name, shape, *(array.shape for array in arrays))
         return call(*arrays)
 
     return run

@@ -1,4 +1,4 @@
-"""Sums over all pixels of all images, for each channel: one pass of a GPU's kernel, where XLA is slow.
+"""Sums over all pixels of all images, for each channel, by a kernel of a GPU, whose few sums XLA adds.
 
 XLA sums over many rows of few numbers at about half of the GPU's bandwidth or less.
 """
@@ -12,12 +12,10 @@ from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton
 from jax.interpreters import ad, batching
 
-from milx.meta.operations import MOST_NUMBERS, operation
+from milx.meta.operations import MOST_NUMBERS, MOST_TASKS, PROGRAMS, check_numbers, operation
 
 _AT_ONCE = 8192
 """Numbers that a program adds at once."""
-_PROGRAMS = 1056
-"""Programs to start, if there are enough numbers: eight for each multiprocessor of an H200."""
 
 
 def sum_over_pixels(x: jax.Array, interpret: bool = False) -> jax.Array:
@@ -25,7 +23,10 @@ def sum_over_pixels(x: jax.Array, interpret: bool = False) -> jax.Array:
 
     Args:
         x: images.
-        interpret: run on any device, slowly, for tests.
+        interpret: run the kernel on any device, slowly, for tests.
+
+    Raises:
+        ValueError: for more numbers in the images of a task than 32 bits count.
     """
     return _sum.bind(x.reshape(1, -1, x.shape[-1]), interpret=interpret)[0]
 
@@ -36,9 +37,10 @@ def _sum_rows(x: jax.Array, *, interpret: bool) -> jax.Array:
     columns = pl.next_power_of_2(channels)
     rows = max(1, _AT_ONCE // columns)
     steps = pl.cdiv(count, rows)
-    parts = min(steps, pl.cdiv(_PROGRAMS, tasks))
+    parts = min(steps, pl.cdiv(PROGRAMS, tasks))
     steps = pl.cdiv(steps, parts)
     wide = jnp.promote_types(x.dtype, jnp.float32)
+    check_numbers("sum_over_pixels", x.shape)
 
     def program(x: Any, sums: Any) -> None:
         part, task = pl.program_id(0), pl.program_id(1)
@@ -63,7 +65,12 @@ def _sum_rows(x: jax.Array, *, interpret: bool) -> jax.Array:
     return call(x.reshape(tasks, -1)).sum(axis=0)
 
 
-_sum = operation(_sum_rows)
+def _sum_plainly(x: jax.Array) -> jax.Array:
+    """Sums [T, N, F] to [T, F] on any device."""
+    return x.sum(axis=1, dtype=jnp.promote_types(x.dtype, jnp.float32))
+
+
+_sum = operation(_sum_rows, _sum_plainly)
 
 
 def _spread(sums: jax.Array, x: Any, **_: Any) -> list[jax.Array]:
@@ -72,9 +79,12 @@ def _spread(sums: jax.Array, x: Any, **_: Any) -> list[jax.Array]:
 
 
 def _map(args: tuple[jax.Array], axes: tuple[int], **settings: Any) -> tuple[jax.Array, int]:
-    """Maps over further tasks: the axis that is mapped joins that of the tasks, if 32 bits count their numbers."""
+    """Maps over further tasks: the axis that is mapped joins that of the tasks.
+
+    If there are too many of them, or of their numbers, one is computed after the other.
+    """
     x = jnp.moveaxis(args[0], axes[0], 0)
-    if x.size > MOST_NUMBERS:
+    if x.size > MOST_NUMBERS or x.shape[0] * x.shape[1] > MOST_TASKS:
         return jax.lax.map(lambda each: _sum.bind(each, **settings), x), 0
     found = _sum.bind(x.reshape(-1, *x.shape[2:]), **settings)
     return found.reshape(*x.shape[:2], -1), 0

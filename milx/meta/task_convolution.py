@@ -15,14 +15,16 @@ import jax.numpy as jnp
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching
 
-from milx.meta import kernels
+from milx.meta import kernels, plain_convolution
 from milx.meta.convolution import same_padding
-from milx.meta.operations import MOST_NUMBERS, operation
+from milx.meta.operations import MOST_NUMBERS, MOST_TASKS, operation
 from milx.meta.tiles import Geometry
 
 
 def convolve_directly(x: jax.Array, kernel: jax.Array, stride: int, interpret: bool = False) -> jax.Array:
-    """Computes `conv2d` by kernels of a GPU: no copies of windows, and little memory.
+    """Computes `conv2d` by kernels of a GPU, without copies of windows; on other devices by XLA's convolution.
+
+    A number that is not finite may reach all outputs of its tile (`tiles.py`), not only those that depend on it.
 
     Args:
         x: [B, H, W, C].
@@ -34,9 +36,11 @@ def convolve_directly(x: jax.Array, kernel: jax.Array, stride: int, interpret: b
         [B, ceil(H / stride), ceil(W / stride), F].
 
     Raises:
-        ValueError: for more than 64 filters or channels, and for so many numbers in the images of a task that 32 bits
-            do not count them.
+        ValueError: for a kernel that is not square or has other channels than x, for more than 64 filters or channels,
+            and for so many numbers in the images of a task that 32 bits do not count them.
     """
+    if kernel.ndim != 4 or kernel.shape[:3] != (kernel.shape[0], kernel.shape[0], x.shape[-1]):
+        raise ValueError(f"kernel: got shape {kernel.shape}, expected [k, k, {x.shape[-1]}, F]")
     dtype = jnp.result_type(x, kernel)
     x, kernel = x.astype(dtype), kernel.astype(dtype)
     size, taps = x.shape[1:3], kernel.shape[0]
@@ -50,9 +54,9 @@ def convolve_directly(x: jax.Array, kernel: jax.Array, stride: int, interpret: b
     return _convolve.bind(x[None], kernel[None], geometry=geometry, interpret=interpret)[0]
 
 
-_convolve = operation(kernels.convolve)
-_to_input = operation(kernels.to_input)
-_to_kernel = operation(kernels.to_kernel)
+_convolve = operation(kernels.convolve, plain_convolution.convolve)
+_to_input = operation(kernels.to_input, plain_convolution.to_input)
+_to_kernel = operation(kernels.to_kernel, plain_convolution.to_kernel)
 
 
 def _jvp(primitive: Primitive, primals: Sequence[Any], tangents: Sequence[Any], **settings: Any) -> tuple[Any, Any]:
@@ -104,8 +108,8 @@ def _transpose(primitive: Primitive, gradient: Any, *pairs: Any, **settings: Any
 def _map(primitive: Primitive, args: Sequence[jax.Array], axes: Sequence[int | None], **settings: Any) -> Any:
     """Maps over further tasks: the axis that is mapped joins that of the tasks.
 
-    What is not mapped is repeated, except for kernels that all tasks share. Where 32 bits do not count the numbers of
-    all tasks, one is computed after the other.
+    What is not mapped is repeated, except for kernels that all tasks share. If there are too many tasks, or if 32 bits
+    do not count the numbers of their images, one is computed after the other.
     """
     count = next(arg.shape[axis] for arg, axis in zip(args, axes, strict=True) if axis is not None)
     each = [arg[None] if axis is None else jnp.moveaxis(arg, axis, 0) for arg, axis in zip(args, axes, strict=True)]
@@ -113,7 +117,7 @@ def _map(primitive: Primitive, args: Sequence[jax.Array], axes: Sequence[int | N
     geometry = settings["geometry"]
     channels, filters = (each[0].shape[-1], each[1].shape[-1]) if primitive is _to_kernel else each[1].shape[-2:]
     pixels = max(math.prod(geometry.size) * channels, math.prod(geometry.shape) * filters)
-    if count * tasks * each[0].shape[2] * pixels > MOST_NUMBERS:
+    if count * tasks > MOST_TASKS or count * tasks * each[0].shape[2] * pixels > MOST_NUMBERS:
         repeated = [jnp.broadcast_to(arg, (count, *arg.shape[1:])) for arg in each]
         return jax.lax.map(lambda args: primitive.bind(*args, **settings), repeated), 0
 

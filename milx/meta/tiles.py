@@ -6,7 +6,6 @@ the image on the gradients of the outputs that saw them. All windows have the sa
 that windows are the rows of a matrix, which is multiplied by weights that repeat the kernel for each pixel of a tile.
 """
 
-import itertools
 import math
 from typing import Any, NamedTuple
 
@@ -36,9 +35,9 @@ class Line(NamedTuple):
     """Along one axis: pixel d of a window meets pixel r of its tile at the kernel's tap of window d + tile r + first.
 
     Attributes:
-        window: what a pixel of a window counts.
-        tile: what a pixel of a tile counts.
-        first: the tap where both are 0.
+        window: taps from one pixel of a window to the next.
+        tile: taps from one pixel of a tile to the next.
+        first: the tap for the first pixels of both.
     """
 
     window: int
@@ -60,7 +59,7 @@ class Tiles(NamedTuple):
         before: pixels by which the first window begins before the image.
         read: rows, columns and channels of the images that are read.
         written: those of the images that are written.
-        taps: along rows and columns.
+        lines: where they meet along rows, and along columns.
     """
 
     tile: Pair
@@ -69,7 +68,7 @@ class Tiles(NamedTuple):
     before: Pair
     read: tuple[int, int, int]
     written: tuple[int, int, int]
-    taps: tuple[Line, Line]
+    lines: tuple[Line, Line]
 
 
 def of_outputs(geometry: Geometry, channels: int, filters: int, tile: Pair, itemsize: int) -> Tiles:
@@ -80,7 +79,7 @@ def of_outputs(geometry: Geometry, channels: int, filters: int, tile: Pair, item
         channels: of the image.
         filters: of the result.
         tile: outputs of a tile.
-        itemsize: bytes of a number: windows of four channels are wide enough to be read 16 bytes at once.
+        itemsize: bytes of a number. Windows of four channels are widened so that their rows are read 16 bytes at once.
     """
     stride, taps, before, size, shape = geometry
     rows, columns = (stride * (count - 1) + taps for count in tile)
@@ -110,12 +109,12 @@ class Places(NamedTuple):
     """Which tiles of which images a program has at once, and how programs share places and images.
 
     Attributes:
-        images: that it has at once.
-        rows: of tiles.
-        columns: of tiles.
-        grid: places that there are, in rows and columns.
-        steps: of a program, which keeps its place and goes on to the next images.
-        chunks: programs for a place, with so many steps each.
+        images: how many it has at once.
+        rows: of tiles that it has at once.
+        columns: of tiles that it has at once.
+        grid: how many places there are, in rows and columns.
+        steps: how often a program, which keeps its place, goes on to the next images.
+        chunks: how many programs share the images of a place.
     """
 
     images: int
@@ -134,7 +133,7 @@ def places(tiles: Tiles, images: int, count: int, others: int, programs: int) ->
         images: B.
         count: tiles at once, a power of two.
         others: programs for each place and each chunk.
-        programs: to have at least, if there are enough images; chunks have the same number of steps.
+        programs: to have about as many or more, if there are enough images.
     """
     sides = [-(-length // side) for length, side in zip(tiles.written, tiles.tile, strict=False)]
     powers = [2**i for i in range(count.bit_length())]
@@ -148,5 +147,6 @@ def places(tiles: Tiles, images: int, count: int, others: int, programs: int) ->
     grid = -(-sides[0] // rows), -(-sides[1] // columns)
     steps = -(-images // at_once)
     enough = min(steps, -(-programs // (others * math.prod(grid))))
-    chunks = next(n for n in itertools.count(enough) if steps % n == 0)
-    return Places(at_once, rows, columns, grid, steps // chunks, chunks)
+    even = [n for n in range(enough, 2 * enough) if steps % n == 0]
+    chunks = even[0] if even else -(-steps // (-(-steps // enough)))
+    return Places(at_once, rows, columns, grid, -(-steps // chunks), chunks)

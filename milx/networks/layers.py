@@ -114,7 +114,7 @@ def with_bias(x: jax.Array, kernel: jax.Array, bias: jax.Array, stride: int) -> 
 
 
 def _sum_over_pixels(x: jax.Array, dtype: jnp.dtype) -> jax.Array:
-    """Sums [B, .., F] to [F]."""
+    """Sums [B, .., F] to [F] of a type; a GPU sums in float32, or in float64 if x is."""
     if jax.default_backend() != "gpu":
         return x.reshape(-1, x.shape[-1]).sum(axis=0, dtype=dtype)
     from milx.meta.pixel_sums import sum_over_pixels  # Pallas takes a quarter of a second to import
@@ -151,7 +151,8 @@ class ConvBlock(nn.Module):
         filters: F, output channels.
         kernel: kernel height and width.
         stride: the same in both directions.
-        mixed_precision: convolve, and hand on, in bfloat16; the norm is computed in the parameters' type.
+        mixed_precision: convolve, and hand on, in bfloat16; the norm is computed in the parameters' type. A GPU rounds
+            the bias for images of three colors, too.
     """
 
     filters: int

@@ -160,7 +160,7 @@ def _paint_tile(geoms, lights, *rest, ranges, view) -> None:
         return tuple(tuple(geoms[geom, first + 4 * i + j] for j in range(4)) for i in range(3))
 
     def in_sight(first):
-        """Tells which of 32 geoms, as bits, have balls in the tile's pyramid, whose sides all contain the camera."""
+        """Tells whose balls reach into the tile's pyramid, whose sides contain the camera: bit i for geom first + i."""
         number = jnp.arange(_WORD)
         geom = jnp.minimum(first + number, len(geoms) - 1)
         x, y, z, radius = (geoms[geom, _BALL + i] for i in range(4))

@@ -1,12 +1,15 @@
 """Convolutions by kernels of a GPU, interpreted, against `jax.lax`."""
 
+import re
+
 import jax
+import jax.export
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from lax_convolution import all_derivatives, assert_agree, reference_conv2d
 
-from milx.meta import kernels, task_convolution
+from milx.meta import kernels, operations, task_convolution
 from milx.meta.task_convolution import convolve_directly
 
 # Images, height, width, channels, filters, kernel and stride.
@@ -37,17 +40,56 @@ def test_value_and_derivatives_are_those_of_lax(rng, shape):
     agree_with_lax(rng, SHAPES[shape])
 
 
-@pytest.mark.parametrize("name", ["_KEPT", "_SUMS"])
-def test_what_programs_do_not_keep_they_read_again_or_share(rng, monkeypatch, name):
-    """Lets no weights be kept, or a program have the sums for a single row of windows."""
-    monkeypatch.setattr(kernels, name, 0)
+@pytest.fixture
+def traced_anew():
+    """Lets programs depend on numbers that a test changes."""
     jax.clear_caches()
-    agree_with_lax(rng, (4, 8, 9, 5, 6, 3, 2))
+    yield
     jax.clear_caches()
+
+
+@pytest.mark.usefixtures("traced_anew")
+@pytest.mark.parametrize(("name", "value"), [("_KEPT", 0), ("_SUMS", 0), ("PROGRAMS", 1), ("_SUMMING", 64)])
+def test_programs_may_keep_less_and_share_more(rng, monkeypatch, name, value):
+    """Keeps no weights, has the sums for one row of windows, or for all places, or shares images among programs."""
+    monkeypatch.setattr(kernels, name, value)
+    agree_with_lax(rng, (7, 8, 9, 5, 6, 3, 2))
+
+
+def test_other_devices_convolve_by_xla(rng):
+    sizes = (2, 7, 8, 3), (4, 4, 3, 5)
+    inputs, directions = (tuple(jnp.asarray(rng.standard_normal(size)) for size in sizes) for _ in range(2))
+    found, expected = (all_derivatives(conv, inputs, directions, 3) for conv in (convolve_directly, reference_conv2d))
+    assert_agree(found, expected, 1e-12)
+
+
+def test_a_saved_program_has_no_kernels_of_a_gpu(rng):
+    """Saves a gradient for two platforms, and runs it on a CPU; without `portable` it could not be saved."""
+    x, kernel = (jnp.asarray(rng.standard_normal(shape)) for shape in ((2, 7, 8, 3), (3, 3, 3, 5)))
+
+    def gradient(kernel):
+        return jax.grad(lambda kernel: jnp.sum(convolve_directly(x, kernel, 2) ** 3))(kernel)
+
+    save = jax.export.export(jax.jit(gradient), platforms=("cpu", "cuda"))
+    with operations.portable():
+        saved = save(jax.ShapeDtypeStruct(kernel.shape, kernel.dtype)).serialize()
+    found = jax.export.deserialize(bytearray(saved)).call(kernel)
+    expected = jax.grad(lambda kernel: jnp.sum(reference_conv2d(x, kernel, 2) ** 3))(kernel)
+    assert_agree(found, expected, 1e-12)
+    lowered = jax.jit(gradient).trace(kernel.astype(jnp.float32)).lower(lowering_platforms=("cuda",))
+    assert "triton" in lowered.as_text()
+
+
+@pytest.mark.parametrize("shape", [(3, 3, 2, 5), (2, 3, 4, 5), (3, 3, 5)])
+def test_kernels_that_do_not_fit_are_refused(shape):
+    expected = rf"kernel: got shape {re.escape(str(shape))}, expected \[k, k, 4, F\]"
+    with pytest.raises(ValueError, match=expected):
+        convolve_directly(jnp.zeros((1, 5, 6, 4)), jnp.zeros(shape), 2)
 
 
 @pytest.mark.parametrize(
-    "axes", [[(0, 0)], [(0, None)], [(None, 0)], [(3, 1)], [(0, None), (0, None)], [(None, 0), (0, None)]]
+    "axes",
+    [[(0, 0)], [(0, None)], [(None, 0)], [(3, 1)], [(0, None), (0, None)], [(None, 0), (0, None)], [(0, None), (0, 0)]],
 )
 def test_gradients_of_mapped_convolutions_are_those_of_lax(rng, axes):
     """Maps images, kernels or both over tasks, once or twice; what tasks share has the sum of their gradients."""
@@ -92,7 +134,7 @@ def test_more_numbers_than_32_bits_count_are_computed_task_by_task(rng, monkeypa
 @pytest.mark.parametrize(
     ("images", "channels", "message"),
     [
-        (2**15, 8, "convolve: got an array of 4294967296 numbers, expected at most 2147418112"),
+        (2**15, 8, "convolve: got an array of 4294967296 numbers, expected at most 2130706432"),
         (1, 65, "filters or channels: got 65, expected at most 64"),
     ],
 )

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from milx.config.schema import ConvConfig
-from milx.meta import pixel_sums
+from milx.meta import pixel_sums, task_convolution
 from milx.networks import layers
 from milx.networks.policy_network import ConvStack
 
@@ -186,3 +186,22 @@ def test_a_bias_as_a_channel_is_added_once(rng, kernel, stride):
 
     agree = lambda found, expected: np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-9)  # noqa: E731
     jax.tree.map(agree, derivatives(channel), derivatives(added))
+
+
+def test_a_block_by_kernels_of_a_gpu_is_that_of_a_cpu(rng, monkeypatch):
+    """Compares value and gradients in bfloat16, of which the first layer's bias is a weight on the GPU alone."""
+    block = layers.ConvBlock(4, 3, 2, mixed_precision=True)
+    x, weights = (jnp.asarray(rng.random(shape), jnp.float32) for shape in ((2, 9, 10, 3), (2, 5, 5, 4)))
+    params = jax.tree.map(lambda p: p + 0.1 * rng.standard_normal(p.shape), block.init(jax.random.key(0), x))
+
+    def derivatives():
+        loss = lambda params: jnp.sum(weights * block.apply(params, x))  # noqa: E731
+        return jax.value_and_grad(loss)(params)
+
+    expected = derivatives()
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    for module, name in ((task_convolution, "convolve_directly"), (pixel_sums, "sum_over_pixels")):
+        monkeypatch.setattr(module, name, functools.partial(getattr(module, name), interpret=True))
+    for found, wanted in zip(jax.tree.leaves(derivatives()), jax.tree.leaves(expected), strict=True):
+        assert found.dtype == wanted.dtype
+        np.testing.assert_allclose(found, wanted, rtol=0, atol=2**-6 * np.abs(wanted).max())

@@ -46,6 +46,23 @@ def test_kernel_paints_what_the_reference_renders(monkeypatch, seed, word):
     assert np.std(expected) > 20
 
 
+def test_kernel_knows_more_geoms_than_a_word_has_bits():
+    """Paints 66 balls in a row, among them those of the last bits of two words, one pixel each."""
+    balls = "".join(f'<geom size=".005" pos="{(i - 32.5) / 66} 0 0" rgba="{(i + 10) / 160} 1 1 1"/>' for i in range(66))
+    camera = f'<camera name="eye" pos="0 0 1" fovy="{np.rad2deg(2 * np.arctan(1 / 132))}" xyaxes="1 0 0 0 1 0"/>'
+    xml = f'<mujoco><worldbody><light pos="0 0 9"/>{camera}{balls}</worldbody></mujoco>'
+    model = mujoco.MjModel.from_xml_string(xml)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    renderer = Renderer(model, "eye", 1, 66)
+    scene = renderer.scene(data)
+    painted = np.asarray(jax.jit(lambda scene: renderer.paint(scene, interpret=True))(scene)).astype(int)
+    frame = jax.jit(renderer.render)(scene)
+    np.testing.assert_array_equal(frame.geom_id[0], np.arange(66))
+    np.testing.assert_allclose(painted, np.asarray(to_uint8(frame.color)).astype(int), atol=1)
+    assert painted[..., 0].min() > 30  # where no ball is seen it is black
+
+
 def test_kernel_passes_over_geoms_without_alpha():
     painted, _, seen = render_both(0)
     hidden = np.bincount(seen[seen > 0]).argmax()
