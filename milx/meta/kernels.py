@@ -9,9 +9,9 @@ W is a product of windows and tiles (`tiles.py`). A program keeps its place in t
 so that what lies outside, and the weights, are the same for all of them. Windows are read from the caches of the GPU as
 often as they overlap, and are not copied.
 
-All raise a ValueError for more than `MOST_CHANNELS` channels or filters, or `MOST_NUMBERS` numbers in an array, those
-of all tasks together. Products are summed in float32, or in float64 where the numbers are. Numbers of 32 bits are
-multiplied as the GPU does by default, which is TF32.
+All raise a ValueError for more than `MOST_NUMBERS` numbers in an array, those of all tasks together. They are meant
+for up to 64 channels and filters (`MOST_CHANNELS`). Products are summed in float32, or in float64 where the numbers
+are. Numbers of 32 bits are multiplied as TF32.
 """
 
 import functools
@@ -26,7 +26,6 @@ from jax import lax
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton
 
-from milx.meta.convolution import MOST_CHANNELS
 from milx.meta.operations import PROGRAMS, check_numbers
 from milx.meta.tiles import Geometry, Pair, Places, Tiles, of_inputs, of_outputs, places
 
@@ -34,19 +33,24 @@ from milx.meta.tiles import Geometry, Pair, Places, Tiles, of_inputs, of_outputs
 _LEAST = 16
 """Least side of the matrices that are multiplied."""
 _BYTES = 256
-"""Most bytes of a row of windows that are multiplied at once, and of one number of all windows."""
+"""Bytes of a row of the matrix of windows that is multiplied, at most, and of a column of it."""
 _KEPT = 96 * 1024
 """Most bytes of weights that a program keeps; it reads more of them anew for every image."""
 _SUMS = 8192
-"""Most sums for all rows of a window that a program keeps; more are shared by a program for each row."""
+"""Most sums for all rows of a window that one program keeps; for more there is a program for each row."""
 _SUMMING = PROGRAMS // 4
-"""Programs to start at least if each writes sums, which are added."""
+"""Programs to start at least where each writes sums of its own, which XLA adds."""
 
 
 def convolve(*pairs: jax.Array, geometry: Geometry, interpret: bool = False) -> jax.Array:
     """Computes y, [T, B, P, Q, F], of x, [T, B, H, W, C], and W, [T, k, k, C, F], or [1, k, k, C, F] for all tasks.
 
-    With more pairs x and W their results are added before they are rounded; so are those of `to_input` and `to_kernel`.
+    With more pairs x and W, their results are added before they are rounded; so are those of the other two functions.
+
+    Args:
+        pairs: x and W, and further pairs of the same shapes, but that each W may have one task or all.
+        geometry: the sizes.
+        interpret: run on any device, slowly, for tests.
     """
     channels, filters = pairs[1].shape[3:]
     wide = 2 if filters <= 32 else 1
@@ -268,10 +272,7 @@ def _pieces(tiles: Tiles, dtype: Any) -> Iterator[Pair]:
 
 
 def _columns(tiles: Tiles) -> int:
-    """Rounds the numbers of a row of a tile up to a width that is multiplied; raises ValueError for too many."""
-    for channels in (tiles.read[2], tiles.written[2]):
-        if channels > MOST_CHANNELS:
-            raise ValueError(f"filters or channels: got {channels}, expected at most {MOST_CHANNELS}")
+    """Rounds the numbers of a row of a tile up to a width that is multiplied."""
     return _power_of_two(tiles.tile[1] * tiles.written[2])
 
 

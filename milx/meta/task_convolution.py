@@ -16,7 +16,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching
 
 from milx.meta import kernels, plain_convolution
-from milx.meta.convolution import same_padding
+from milx.meta.convolution import MOST_CHANNELS, same_padding
 from milx.meta.operations import MOST_NUMBERS, MOST_TASKS, operation
 from milx.meta.tiles import Geometry
 
@@ -41,6 +41,8 @@ def convolve_directly(x: jax.Array, kernel: jax.Array, stride: int, interpret: b
     """
     if kernel.ndim != 4 or kernel.shape[:3] != (kernel.shape[0], kernel.shape[0], x.shape[-1]):
         raise ValueError(f"kernel: got shape {kernel.shape}, expected [k, k, {x.shape[-1]}, F]")
+    if max(kernel.shape[2:]) > MOST_CHANNELS:
+        raise ValueError(f"kernel: got shape {kernel.shape}, expected at most {MOST_CHANNELS} channels and filters")
     dtype = jnp.result_type(x, kernel)
     x, kernel = x.astype(dtype), kernel.astype(dtype)
     size, taps = x.shape[1:3], kernel.shape[0]
