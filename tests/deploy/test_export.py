@@ -35,9 +35,10 @@ print(json.dumps(sorted({name.split(".")[0] for name in sys.modules})))
 """
 
 
-def make_policy(method="mil", **settings):
+def make_policy(method="mil", mixed_precision=False, **settings):
     """Makes an untrained policy for small images, whose whitening is not the identity."""
     config = make_config("reach", method, "cpu")
+    config.network.mixed_precision = mixed_precision
     config.env.image_shape, config.env.goal_step = (16, 20), 20
     config.network.filters, config.network.strides, config.network.fc_layers = (4, 4), (2, 2), (16,)
     if settings.get("given") == "video":
@@ -126,6 +127,26 @@ def test_programs_are_for_cpu_and_cuda_and_other_inputs_are_refused(tmp_path):
             policy.adapt(**arguments)
     with pytest.raises(ValueError, match=r"state: got shape \[70, 8\], expected \[..., 8\]"):
         policy.act(task_params, image=image[0], state=state)
+
+
+def test_what_a_gpu_s_machine_exports_a_cpu_runs(tmp_path, monkeypatch):
+    """Exports as if there were a GPU, whose kernels no file can hold; bfloat16 rounds differently there."""
+    policy, rng = make_policy(mixed_precision=True), np.random.default_rng(0)
+    demo = {
+        "image": rng.integers(0, 256, (T, 16, 20, 3), np.uint8),
+        "state": rng.normal(size=(T, 8)).astype(np.float32),
+        "action": rng.uniform(-1, 1, (T, 2)).astype(np.float32),
+    }
+    task_params = policy.adapt(policy.params, milx.Demo(**demo))
+    seen = milx.Observation(demo["image"][0], demo["state"][0])
+    expected = policy.act(task_params, seen)
+    with monkeypatch.context() as patched:
+        patched.setattr(jax, "default_backend", lambda: "gpu")
+        export(policy, tmp_path / "out")
+    exported = standalone.Policy(tmp_path / "out")
+    found = exported.act(exported.adapt(**demo), image=seen.image, state=seen.state)
+    np.testing.assert_allclose(found, expected, atol=0.02)
+    assert np.abs(found - policy.act(policy.method.unadapted(policy.params), seen)).max() > 0.02
 
 
 def test_a_file_that_is_not_the_exported_one_is_refused(tmp_path):
