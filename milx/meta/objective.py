@@ -48,7 +48,7 @@ def meta_gradient(
 
     def of_group(tasks: Any) -> tuple[Any, tuple[jax.Array, Any]]:
         def mean_loss(params: Any) -> tuple[jax.Array, tuple[jax.Array, Any]]:
-            found = jax.vmap(task_loss)(repeat(params, _count(tasks)), tasks)
+            found = jax.vmap(task_loss)(for_each_task(params, _count(tasks)), tasks)
             if has_aux and not (isinstance(found, tuple) and len(found) == 2):
                 raise ValueError("task_loss: got no pair, expected one with has_aux")
             losses, aux = found if has_aux else (found, None)
@@ -75,11 +75,12 @@ def meta_gradient(
     return mean, found if has_aux else found[0]
 
 
-def repeat(params: Any, count: int) -> Any:
-    """Gives every task its own copy of the parameters, with a leading axis.
+def for_each_task(params: Any, count: int) -> Any:
+    """Gives each of N tasks its own copy of the parameters, with a leading axis [N].
 
-    Then all gradients by one parameter are added for each task before they are summed over the tasks, once. Where tasks
-    share the parameters, each of these gradients is summed over them on its own.
+    Then all gradients by one parameter are added for each task before they are summed over the tasks, once, which takes
+    memory for one gradient of each task. Where tasks share the parameters, each of these gradients is summed over them
+    on its own.
     """
     return jax.tree.map(lambda p: jnp.broadcast_to(p, (count, *jnp.shape(p))), params)
 

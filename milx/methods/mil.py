@@ -21,7 +21,7 @@ import jax.numpy as jnp
 
 from milx import meta
 from milx.config.schema import GIVEN, Config, MethodConfig, number
-from milx.meta.objective import repeat
+from milx.meta.objective import for_each_task
 from milx.methods.base import Method
 from milx.methods.imitation import (
     behavioral_cloning,
@@ -175,7 +175,7 @@ class MIL(Method):
             loss = meta.multi_step_loss(jnp.stack([loss for loss, _ in found]), progress)
             return loss, found[-1][1]
 
-        loss, metrics = jax.vmap(task_loss)(repeat(params, len(batch.query.action)), batch.support, batch.query)
+        loss, metrics = jax.vmap(task_loss)(for_each_task(params, len(batch.query.action)), batch.support, batch.query)
         return loss.mean(), {"loss": loss, **metrics}
 
     def imitation(self, params: Params, batch: TaskBatch) -> tuple[jax.Array, dict[str, jax.Array]]:
