@@ -189,6 +189,7 @@ class _Spot(NamedTuple):
 
 
 def _spot(at: Places, place: jax.Array) -> _Spot:
+    """Finds the tiles of the place of this number, counted row by row."""
     number = _numbers(at.images * at.rows * at.columns)
     rest = number // at.columns
     first = place // at.grid[1] * at.rows, place % at.grid[1] * at.columns
