@@ -34,10 +34,14 @@ _LEAST = 16
 """Least side of the matrices that are multiplied."""
 _BYTES = 256
 """Bytes of a row of the matrix of windows that is multiplied, at most, and of a column of it."""
+_TOTALS = 8192
+"""Most sums of a program that computes values of the convolution."""
 _KEPT = 96 * 1024
 """Most bytes of weights that a program keeps; it reads more of them anew for every image."""
 _SUMS = 8192
-"""Most sums for all rows of a window that one program keeps; for more there is a program for each row."""
+"""Most sums for all rows of a window that one program keeps; for more there is a program for each row, except for
+images of four channels, where it has `_MORE`."""
+_MORE = 20480
 _SUMMING = PROGRAMS // 4
 """Programs to start at least where each writes sums of its own, which XLA adds."""
 
@@ -56,14 +60,15 @@ def convolve(*pairs: jax.Array, geometry: Geometry, interpret: bool = False) -> 
     wide = 2 if filters <= 32 else 1
     one, two = (of_outputs(geometry, channels, filters, (rows, wide), pairs[0].dtype.itemsize) for rows in (1, 2))
     tiles = two if channels > 4 and _keeps(two, geometry.taps, pairs) else one
-    return _multiply(pairs, geometry.taps, tiles, (filters, 1), "convolve", interpret)
+    rows = min(_rows(pairs), _TOTALS // (tiles.tile[0] * _columns(tiles)))
+    return _multiply(pairs, geometry.taps, tiles, (filters, 1), rows, "convolve", interpret)
 
 
 def to_input(*pairs: jax.Array, geometry: Geometry, interpret: bool = False) -> jax.Array:
     """Computes the transpose in x, [T, B, H, W, C], of dy, [T, B, P, Q, F], by W, which is as in `convolve`."""
     channels, filters = pairs[1].shape[3:]
     tiles = of_inputs(geometry, channels, filters)
-    return _multiply(pairs, geometry.taps, tiles, (1, filters), "to_input", interpret)
+    return _multiply(pairs, geometry.taps, tiles, (1, filters), _rows(pairs), "to_input", interpret)
 
 
 def to_kernel(*pairs: jax.Array, geometry: Geometry, interpret: bool = False) -> jax.Array:
@@ -73,14 +78,15 @@ def to_kernel(*pairs: jax.Array, geometry: Geometry, interpret: bool = False) ->
     """
     stride, taps = geometry.stride, geometry.taps
     channels, filters = pairs[0].shape[-1], pairs[1].shape[-1]
-    tiles = of_outputs(geometry, channels, filters, (1, 2 if filters <= 16 else 1), pairs[0].dtype.itemsize)
+    wide = 1 if filters > 16 else 4 if channels <= 4 else 2
+    tiles = of_outputs(geometry, channels, filters, (1, wide), pairs[0].dtype.itemsize)
     sums = _sum_products(pairs, tiles, interpret)
     pixels = (sums[:, :, stride * j : stride * j + taps, :, j] for j in range(tiles.tile[1]))
     return functools.reduce(jnp.add, pixels).astype(pairs[0].dtype)
 
 
 def _multiply(
-    pairs: Sequence[jax.Array], taps: int, tiles: Tiles, strides: Pair, name: str, interpret: bool
+    pairs: Sequence[jax.Array], taps: int, tiles: Tiles, strides: Pair, rows: int, name: str, interpret: bool
 ) -> jax.Array:
     """Multiplies windows by weights: [T, B, rows, columns, channels] that are written.
 
@@ -89,13 +95,14 @@ def _multiply(
         taps: k.
         tiles: what is computed.
         strides: from a channel that is read, and from one that is written, to the next in the kernel's memory.
+        rows: windows that a program multiplies at once.
         name: of the operation.
         interpret: run on any device, slowly, for tests.
     """
     (tasks, images), dtype = pairs[0].shape[:2], pairs[0].dtype
     columns, pieces, meetings = _columns(tiles), list(_pieces(tiles, dtype)), _meetings(tiles, taps)
     keeps, sums = _keeps(tiles, taps, pairs), tiles.tile[0] * columns
-    at = places(tiles, images, _BYTES // dtype.itemsize, tasks, PROGRAMS)
+    at = places(tiles, images, rows, tasks, PROGRAMS)
     shared = [len(kernel) < tasks for kernel in pairs[1::2]]
     parts = list(itertools.product(range(len(shared)), sorted({row for row, _ in meetings}), pieces))
 
@@ -135,12 +142,13 @@ def _multiply(
 def _sum_products(pairs: Sequence[jax.Array], tiles: Tiles, interpret: bool) -> jax.Array:
     """Sums the products of windows and tiles of one row, u' outputs: [T, rows and columns of a window, C, u', F]."""
     (tasks, images), dtype = pairs[0].shape[:2], pairs[0].dtype
-    columns, pieces = _columns(tiles), list(_pieces(tiles, dtype))
+    columns, pieces = _columns(tiles), list(_pieces(tiles, dtype, 4 * _LEAST))
     (rows, length), channels = tiles.window, tiles.read[2]
     sums = rows * columns * sum(width for _, width in pieces)
-    alone = sums <= _SUMS  # a program keeps the sums for all rows of a window
+    many = sums > _SUMS
+    alone = not many or (channels <= 4 and sums <= _MORE)  # a program keeps the sums for all rows of a window
     others = tasks if alone else tasks * rows
-    count = 64 if not alone or sums <= _SUMS // 2 else 32
+    count = 64 if many or sums <= _SUMS // 2 else 32
     at = places(tiles, images, max(_LEAST, count * 2 // dtype.itemsize), others, _SUMMING)
     there = math.prod(at.grid)
     each = max(1, there * at.chunks * others // PROGRAMS)  # places of a program, so that few sums are left to add
@@ -175,7 +183,7 @@ def _sum_products(pairs: Sequence[jax.Array], tiles: Tiles, interpret: bool) -> 
 
     shape = programs * at.chunks, tasks, rows, length * channels, tiles.tile[1] * tiles.written[2]
     grid = programs * (1 if alone else rows), at.chunks, tasks
-    call = _call(program, shape, _wide(dtype), grid, "to_kernel", *((2, 1) if alone else (4, 3)), interpret)
+    call = _call(program, shape, _wide(dtype), grid, "to_kernel", *((4, 3) if many else (2, 1)), interpret)
     total = call(*(array.reshape(tasks, -1) for array in pairs)).sum(axis=0)
     return total.reshape(tasks, rows, length, channels, tiles.tile[1], tiles.written[2])
 
@@ -257,19 +265,23 @@ def _keeps(tiles: Tiles, taps: int, pairs: Sequence[jax.Array]) -> bool:
     return numbers * pairs[0].dtype.itemsize <= _KEPT
 
 
-def _pieces(tiles: Tiles, dtype: Any) -> Iterator[Pair]:
+def _pieces(tiles: Tiles, dtype: Any, least: int = 2 * _LEAST) -> Iterator[Pair]:
     """Cuts the numbers of a row of a window into pieces: first and width of each.
 
-    Widths are powers of two, so the last piece may reach beyond the end.
+    Widths are powers of two, so the last piece may reach beyond the end: by a quarter, or up to the `least` width.
     """
     first, length = 0, tiles.window[1] * tiles.read[2]
     while first < length:
         rest = length - first
         width = min(_power_of_two(rest), _BYTES // jnp.dtype(dtype).itemsize)
-        if width > max(1.25 * rest, 2 * _LEAST):
+        if width > max(1.25 * rest, least):
             width //= 2
         yield first, width
         first += width
+
+
+def _rows(pairs: Sequence[jax.Array]) -> int:
+    return _BYTES // pairs[0].dtype.itemsize
 
 
 def _columns(tiles: Tiles) -> int:

@@ -1,12 +1,10 @@
 """Layers whose weights may differ from task to task."""
 
-import functools
-
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from milx.meta.convolution import conv2d, has_kernels, same_padding
+from milx.meta.convolution import conv2d
 
 
 def positions(height: int, width: int) -> jax.Array:
@@ -50,78 +48,6 @@ def layer_norm(x: jax.Array) -> jax.Array:
     return (x - mean) * jax.lax.rsqrt(variance + 1e-6)
 
 
-@jax.custom_vjp
-def add_bias(x: jax.Array, bias: jax.Array) -> jax.Array:
-    """Adds a bias [F] to [.., F] in the bias's type, and computes the bias's gradient by `_sum_over_pixels`.
-
-    Like `shifted_relu`, it can be differentiated in reverse, and forward over reverse, but not forward alone.
-    """
-    return x.astype(bias.dtype) + bias
-
-
-def _add_bias_forward(x: jax.Array, bias: jax.Array) -> tuple[jax.Array, jax.Array]:
-    return x.astype(bias.dtype) + bias, jnp.zeros((), x.dtype)
-
-
-def _add_bias_backward(like: jax.Array, gradient: jax.Array) -> tuple[jax.Array, jax.Array]:
-    rounded = gradient.astype(like.dtype)
-    return rounded, _sum_over_pixels(rounded, gradient.dtype)
-
-
-add_bias.defvjp(_add_bias_forward, _add_bias_backward)
-
-
-@functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
-def shifted_relu(x: jax.Array, center: jax.Array, dtype: jnp.dtype) -> jax.Array:
-    """Computes relu([.., F] plus [F]) as `dtype`, and the center's gradient by `_sum_over_pixels`."""
-    return nn.relu(x + center).astype(dtype)
-
-
-def _shifted_relu_forward(x: jax.Array, center: jax.Array, dtype: jnp.dtype) -> tuple[jax.Array, tuple]:
-    y = nn.relu(x + center).astype(dtype)
-    return y, (y, jnp.zeros((), x.dtype))
-
-
-def _shifted_relu_backward(dtype: jnp.dtype, kept: tuple, gradient: jax.Array) -> tuple[jax.Array, jax.Array]:
-    y, like = kept
-    passed = jnp.where(y > 0, gradient, 0)
-    return passed.astype(like.dtype), _sum_over_pixels(passed, like.dtype)
-
-
-shifted_relu.defvjp(_shifted_relu_forward, _shifted_relu_backward)
-
-
-def with_bias(x: jax.Array, kernel: jax.Array, bias: jax.Array, stride: int) -> tuple[jax.Array, jax.Array]:
-    """Makes a convolution's bias the weight of one more channel, which is one in every pixel.
-
-    It has this weight at the tap that sees a pixel of the image for every output, and none at the others.
-
-    Args:
-        x: [B, H, W, C].
-        kernel: [k, k, C, F].
-        bias: [F].
-        stride: the same in both directions.
-
-    Returns:
-        [B, H, W, C + 1] and [k, k, C + 1, F], in the types of x and of the kernel.
-    """
-    taps = kernel.shape[0]
-    sees = [same_padding(size, taps, stride)[0] for size in x.shape[1:3]]
-    at = [(tap, taps - 1 - tap) for tap in sees]
-    weights = jnp.pad(bias.astype(kernel.dtype)[None, None, None], (*at, (0, 0), (0, 0)))
-    ones = jnp.pad(x, ((0, 0), (0, 0), (0, 0), (0, 1)), constant_values=1)
-    return ones, jnp.concatenate([kernel, weights], axis=2)
-
-
-def _sum_over_pixels(x: jax.Array, dtype: jnp.dtype) -> jax.Array:
-    """Sums [B, .., F] to [F] of a type; a GPU sums in float32, or in float64 if x is."""
-    if jax.default_backend() != "gpu":
-        return x.reshape(-1, x.shape[-1]).sum(axis=0, dtype=dtype)
-    from milx.meta.pixel_sums import sum_over_pixels  # Pallas takes a quarter of a second to import
-
-    return sum_over_pixels(x).astype(dtype)
-
-
 class Conv(nn.Module):
     """`flax.linen.Conv` with a square kernel, SAME padding and a bias, computed by `conv2d`; its parameters fit.
 
@@ -151,8 +77,7 @@ class ConvBlock(nn.Module):
         filters: F, output channels.
         kernel: kernel height and width.
         stride: the same in both directions.
-        mixed_precision: convolve, and hand on, in bfloat16; the norm is computed in the parameters' type. A GPU rounds
-            the bias for images of three colors, too.
+        mixed_precision: convolve, and hand on, in bfloat16; the norm is computed in the parameters' type.
     """
 
     filters: int
@@ -168,13 +93,13 @@ class ConvBlock(nn.Module):
         bias = self.param("bias", nn.initializers.zeros, (self.filters,))
         center = self.param("centre", nn.initializers.zeros, (self.filters,))
         dtype = jnp.bfloat16 if self.mixed_precision else kernel.dtype
-        x, kernel = x.astype(dtype), kernel.astype(dtype)
-        if has_kernels(x, kernel) and x.shape[-1] == 3:  # they read a fourth channel anyway
-            x = conv2d(*with_bias(x, kernel, bias, self.stride), self.stride).astype(bias.dtype)
-        else:
-            x = add_bias(conv2d(x, kernel, self.stride), bias)
-        x = layer_norm(x)
-        return shifted_relu(x if skip is None else x + skip, center, dtype)
+        x = conv2d(x.astype(dtype), kernel.astype(dtype), self.stride)
+        if jax.default_backend() == "gpu" and skip is None:
+            from milx.networks.channel_norm import normalize  # Pallas takes a quarter of a second to import
+
+            return normalize(x, bias, center, dtype)
+        x = layer_norm(x.astype(bias.dtype) + bias) + center
+        return nn.relu(x if skip is None else x + skip).astype(dtype)
 
 
 class FixedConv(nn.Module):

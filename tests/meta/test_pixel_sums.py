@@ -1,60 +1,90 @@
-"""Sums over pixels by a kernel of a GPU, interpreted, against sums of an array."""
+"""Sums over pixels by a kernel of a GPU, interpreted, against sums of arrays."""
+
+import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from milx.meta import pixel_sums
+from milx.meta import pixel_sums as home
+from milx.meta.pixel_sums import pixel_sums, scale_and_shift
 
-# Tasks, images, rows, columns and channels; the program adds 512 rows of 16 numbers at once.
-SHAPES = {"several programs": (2, 3, 20, 21, 10), "one pixel": (3, 1, 1, 1, 7), "many channels": (1, 2, 3, 3, 200)}
-
-
-def of_tasks(x):
-    return jax.vmap(lambda x: pixel_sums.sum_over_pixels(x, interpret=True))(x)
+# Tasks, images, rows, columns and channels; a program reads 256 rows of 16 numbers at once.
+SHAPES = {"several steps": (2, 3, 20, 21, 10), "one pixel": (3, 1, 1, 1, 7), "many channels": (1, 2, 3, 3, 200)}
 
 
-def plainly(x):
-    return x.reshape(len(x), -1, x.shape[-1]).sum(axis=1)
+def plainly(u, x, gate=None):
+    keep = 1 if gate is None else scale_and_shift(x, *gate) > 0
+    return tuple((keep * each).sum(axis=(1, 2)) for each in (u, u * x))
 
 
+def derivatives(by, inputs, directions, gate):
+    """Returns value, gradient, forward over reverse, and reverse over reverse, of a function of the sums of tasks."""
+
+    def cubed(inputs):
+        sums = jax.vmap(by)(*inputs, gate)
+        return sum(jnp.sum(each**3) for each in sums)
+
+    def along(inputs):
+        return sum(map(jnp.vdot, jax.grad(cubed)(inputs), directions))
+
+    return jax.vmap(by)(*inputs, gate), jax.jvp(jax.grad(cubed), (inputs,), (directions,)), jax.grad(along)(inputs)
+
+
+@pytest.mark.parametrize("gated", [False, True])
 @pytest.mark.parametrize("shape", SHAPES)
-def test_sums_and_their_derivatives(rng, shape):
-    x, direction = (jnp.asarray(rng.standard_normal(SHAPES[shape])) for _ in range(2))
+def test_sums_and_their_derivatives(rng, shape, gated):
+    tasks, images, *_, channels = SHAPES[shape]
+    inputs, directions = (tuple(jnp.asarray(rng.standard_normal(SHAPES[shape])) for _ in range(2)) for _ in range(2))
+    gate = tuple(jnp.asarray(rng.standard_normal(each)) for each in ((tasks, images), (tasks, images, channels)))
+    found, expected = (
+        derivatives(by, inputs, directions, gate if gated else None)
+        for by in (functools.partial(pixel_sums, interpret=True), plainly)
+    )
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-8), found, expected)
 
-    def derivatives(sums):
-        cubed = lambda x: jnp.sum(sums(x) ** 3)  # noqa: E731
-        along = lambda x: jnp.vdot(jax.grad(cubed)(x), direction)  # noqa: E731
-        return sums(x), jax.jvp(jax.grad(cubed), (x,), (direction,)), jax.grad(along)(x)
 
-    for found, expected in zip(
-        jax.tree.leaves(derivatives(of_tasks)), jax.tree.leaves(derivatives(plainly)), strict=True
-    ):
-        np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-9)
+def test_derivatives_of_the_sums_of_squares(rng):
+    inputs, directions = ((jnp.asarray(rng.standard_normal((2, 3, 4, 5, 6))),) for _ in range(2))
+    found, expected = (
+        derivatives(lambda x, _, by=by: by(x, x), inputs, directions, None)
+        for by in (functools.partial(pixel_sums, interpret=True), plainly)
+    )
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-8), found, expected)
+
+
+def test_images_that_all_tasks_share(rng):
+    u, x = (jnp.asarray(rng.standard_normal(shape)) for shape in ((2, 3, 4, 5, 6), (3, 4, 5, 6)))
+    found = jax.vmap(functools.partial(pixel_sums, interpret=True), in_axes=(0, None))(u, x)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-12), found, jax.vmap(plainly, (0, None))(u, x))
 
 
 def test_programs_share_many_steps(rng, monkeypatch):
-    monkeypatch.setattr(pixel_sums, "PROGRAMS", 2)
-    monkeypatch.setattr(pixel_sums, "_AT_ONCE", 64)
-    x = jnp.asarray(rng.standard_normal((2, 5, 23, 3)))  # a shape of its own, since JAX keeps what it has traced
-    np.testing.assert_allclose(of_tasks(x[None])[0], plainly(x[None])[0], rtol=1e-12)
+    monkeypatch.setattr(home, "PROGRAMS", 8)
+    monkeypatch.setattr(home, "_AT_ONCE", 64)
+    u, x = (jnp.asarray(rng.standard_normal((3, 5, 23, 3))) for _ in range(2))  # a shape of its own: JAX keeps traces
+    found = pixel_sums(u, x, interpret=True)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12), found, plainly(u, x))
 
 
-def test_other_devices_sum_by_xla(rng):
-    x = jnp.asarray(rng.standard_normal((3, 4, 5)))
-    np.testing.assert_allclose(pixel_sums.sum_over_pixels(x), x.sum(axis=(0, 1)), rtol=1e-12)
+@pytest.mark.parametrize("gated", [False, True])
+def test_other_devices_sum_by_xla(rng, gated):
+    u, x, scale, shift = (jnp.asarray(rng.standard_normal(s)) for s in ((2, 3, 4, 5), (2, 3, 4, 5), (2,), (2, 5)))
+    gate = (scale, shift) if gated else None
+    found = pixel_sums(u, x, gate)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-10), found, plainly(u, x, gate))
 
 
-def test_more_numbers_of_a_task_than_32_bits_count_are_refused():
+def test_more_numbers_than_32_bits_count_are_refused():
     x = jax.ShapeDtypeStruct((2**15, 256, 256, 1), jnp.bfloat16)
-    with pytest.raises(ValueError, match="sum_over_pixels: got an array of 2147483648 numbers, expected at most"):
-        jax.eval_shape(pixel_sums.sum_over_pixels, x)
+    with pytest.raises(ValueError, match="pixel_sums: got an array of 2147483648 numbers, expected at most"):
+        jax.eval_shape(pixel_sums, x, x)
 
 
 def test_more_numbers_than_32_bits_count_are_summed_task_by_task(rng, monkeypatch):
-    monkeypatch.setattr(pixel_sums, "MOST_NUMBERS", 100)
-    x = jnp.asarray(rng.standard_normal((3, 2, 4, 5, 2)))
-    program = str(jax.make_jaxpr(of_tasks)(x))
-    assert "scan" in program
-    np.testing.assert_allclose(of_tasks(x), plainly(x), rtol=1e-12)
+    monkeypatch.setattr(home, "MOST_NUMBERS", 100)
+    u, x = (jnp.asarray(rng.standard_normal((3, 2, 4, 5, 2))) for _ in range(2))
+    of_tasks = jax.vmap(functools.partial(pixel_sums, interpret=True))
+    assert "scan" in str(jax.make_jaxpr(of_tasks)(u, x))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-10), of_tasks(u, x), jax.vmap(plainly)(u, x))

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from milx.config.schema import ConvConfig
-from milx.meta import pixel_sums, task_convolution
-from milx.networks import layers
+from milx.meta import task_convolution
+from milx.networks import channel_norm, layers
 from milx.networks.policy_network import ConvStack
 
 # Convolution.
@@ -121,86 +121,24 @@ def test_residual_blocks_add_two_convolutions_to_their_input(rng):
     assert len(params) == 5
 
 
-# Bias and center: derivatives of their own, which must be those that JAX finds.
+# On a GPU.
 
 
-@pytest.fixture(params=["CPU", "GPU"])
-def device(request, monkeypatch):
-    """Sums by the CPU, or by the GPU's kernel, interpreted."""
-    if request.param == "GPU":
-        monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-        interpreted = functools.partial(pixel_sums.sum_over_pixels, interpret=True)
-        monkeypatch.setattr(pixel_sums, "sum_over_pixels", interpreted)
-
-
-@pytest.mark.usefixtures("device")
-@pytest.mark.parametrize(
-    ("written", "plain"),
-    [
-        (layers.add_bias, lambda x, shift: x + shift),
-        (lambda x, shift: layers.shifted_relu(x, shift, x.dtype), lambda x, shift: jax.nn.relu(x + shift)),
-    ],
-)
-def test_derivatives_of_bias_and_center(rng, written, plain):
-    inputs = jnp.asarray(rng.standard_normal((2, 3, 4, 5))), jnp.asarray(rng.standard_normal(5))
-    tangent = jax.tree.map(lambda x: jnp.asarray(rng.standard_normal(x.shape)), inputs)
-
-    def derivatives(function):
-        gradient = jax.grad(lambda inputs: jnp.sum(jnp.sin(function(*inputs)) ** 2))
-        return jax.jvp(gradient, (inputs,), (tangent,))
-
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-12), derivatives(written), derivatives(plain))
-
-
-@pytest.mark.usefixtures("device")
-@pytest.mark.parametrize("shape", [(4096, 3), (2, 2048, 3)])
-def test_gradients_of_bfloat16_images_are_summed_in_float32(shape):
-    # 4,096 times 1/3: a sum in bfloat16 would stop growing at 256 times as much as one of its terms.
-    x, weight = jnp.ones(shape), 1 / 3
-    expected = np.full(3, 4096 * float(jnp.bfloat16(weight)))
-    bias = jax.grad(lambda bias: weight * layers.add_bias(x.astype(jnp.bfloat16), bias).sum())(jnp.zeros(3))
-    np.testing.assert_allclose(bias, expected, rtol=1e-6)
-    center = jax.grad(lambda center: (weight * layers.shifted_relu(x, center, jnp.bfloat16).astype(float)).sum())
-    np.testing.assert_allclose(center(jnp.zeros(3)), expected, rtol=1e-6)
-
-
-@pytest.mark.parametrize(("kernel", "stride"), [(5, 2), (3, 1), (1, 2), (2, 3)])
-def test_a_bias_as_a_channel_is_added_once(rng, kernel, stride):
-    """Compares the convolution of one more channel, and its derivatives, with a bias that is added."""
-    shapes = (2, 7, 9, 3), (kernel, kernel, 3, 4), (4,)
-    inputs, directions = (tuple(jnp.asarray(rng.standard_normal(shape)) for shape in shapes) for _ in range(2))
-    axes = ("NHWC", "HWIO", "NHWC")
-
-    def convolve(x, kernel):
-        return jax.lax.conv_general_dilated(x, kernel, (stride, stride), "SAME", dimension_numbers=axes)
-
-    def added(x, kernel, bias):
-        return convolve(x, kernel) + bias
-
-    def channel(*inputs):
-        return convolve(*layers.with_bias(*inputs, stride))
-
-    def derivatives(convolution):
-        gradient = jax.grad(lambda inputs: jnp.sum(convolution(*inputs) ** 3))
-        return convolution(*inputs), jax.jvp(gradient, (inputs,), (directions,))
-
-    agree = lambda found, expected: np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-9)  # noqa: E731
-    jax.tree.map(agree, derivatives(channel), derivatives(added))
-
-
-def test_a_block_by_kernels_of_a_gpu_is_that_of_a_cpu(rng, monkeypatch):
-    """Compares value and gradients in bfloat16, of which the first layer's bias is a weight on the GPU alone."""
+@pytest.mark.parametrize("skips", [False, True])
+def test_a_block_by_kernels_of_a_gpu_is_that_of_a_cpu(rng, monkeypatch, skips):
+    """Compares value and gradients in bfloat16."""
     block = layers.ConvBlock(4, 3, 2, mixed_precision=True)
-    x, weights = (jnp.asarray(rng.random(shape), jnp.float32) for shape in ((2, 9, 10, 3), (2, 5, 5, 4)))
+    x, weights, skip = (jnp.asarray(rng.random(shape), jnp.float32) for shape in ((2, 9, 10, 3), *[(2, 5, 5, 4)] * 2))
+    skip = skip if skips else None
     params = jax.tree.map(lambda p: p + 0.1 * rng.standard_normal(p.shape), block.init(jax.random.key(0), x))
 
     def derivatives():
-        loss = lambda params: jnp.sum(weights * block.apply(params, x))  # noqa: E731
+        loss = lambda params: jnp.sum(weights * block.apply(params, x, skip))  # noqa: E731
         return jax.value_and_grad(loss)(params)
 
     expected = derivatives()
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    for module, name in ((task_convolution, "convolve_directly"), (pixel_sums, "sum_over_pixels")):
+    for module, name in ((task_convolution, "convolve_directly"), (channel_norm, "normalize")):
         monkeypatch.setattr(module, name, functools.partial(getattr(module, name), interpret=True))
     for found, wanted in zip(jax.tree.leaves(derivatives()), jax.tree.leaves(expected), strict=True):
         assert found.dtype == wanted.dtype
