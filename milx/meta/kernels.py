@@ -42,6 +42,8 @@ _SUMS = 8192
 """Most sums for all rows of a window that one program keeps; for more there is a program for each row, except for
 images of four channels, where it has `_MORE`."""
 _MORE = 20480
+_SHARED = 200 * 1024
+"""Most bytes that a program reads ahead, three steps at once; an H200 has 227 KiB of shared memory."""
 _SUMMING = PROGRAMS // 4
 """Programs to start at least where each writes sums of its own, which XLA adds."""
 
@@ -183,7 +185,9 @@ def _sum_products(pairs: Sequence[jax.Array], tiles: Tiles, interpret: bool) -> 
 
     shape = programs * at.chunks, tasks, rows, length * channels, tiles.tile[1] * tiles.written[2]
     grid = programs * (1 if alone else rows), at.chunks, tasks
-    call = _call(program, shape, _wide(dtype), grid, "to_kernel", *((4, 3) if many else (2, 1)), interpret)
+    read = len(pairs) // 2 * count * (columns + sums // (columns * (1 if alone else rows))) * dtype.itemsize
+    stages = 3 if many and 3 * read <= _SHARED else 1
+    call = _call(program, shape, _wide(dtype), grid, "to_kernel", 4 if many else 2, stages, interpret)
     total = call(*(array.reshape(tasks, -1) for array in pairs)).sum(axis=0)
     return total.reshape(tasks, rows, length, channels, tiles.tile[1], tiles.written[2])
 
