@@ -34,7 +34,7 @@ def conv2d(x: jax.Array, kernel: jax.Array, stride: int) -> jax.Array:
     Returns:
         [B, ceil(H / stride), ceil(W / stride), F].
     """
-    if has_kernels(x, kernel):
+    if _has_kernels(x, kernel):
         from milx.meta.task_convolution import convolve_directly  # Pallas takes a quarter of a second to import
 
         return convolve_directly(x, kernel, stride)
@@ -42,7 +42,7 @@ def conv2d(x: jax.Array, kernel: jax.Array, stride: int) -> jax.Array:
     return by(x, kernel, stride)
 
 
-def has_kernels(x: jax.Array, kernel: jax.Array) -> bool:
+def _has_kernels(x: jax.Array, kernel: jax.Array) -> bool:
     """Tells whether `conv2d` convolves by Pallas kernels: on a GPU, in bfloat16, and for sizes that they can have."""
     few = max(kernel.shape[2:]) <= MOST_CHANNELS and math.prod(x.shape[:3]) * max(*kernel.shape[2:], 4) < 2**30
     return jax.default_backend() == "gpu" and jnp.result_type(x, kernel) == jnp.bfloat16 and few

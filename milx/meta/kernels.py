@@ -29,7 +29,8 @@ from jax.experimental.pallas import triton
 from milx.meta.operations import PROGRAMS, check_numbers
 from milx.meta.tiles import Geometry, Pair, Places, Tiles, of_inputs, of_outputs, places
 
-# The numbers below were chosen by timing push's and reach's layers on an H200, in bfloat16.
+# The numbers below, but for that of shared memory, were chosen by timing push's and reach's layers on an H200, in
+# bfloat16.
 _LEAST = 16
 """Least side of the matrices that are multiplied."""
 _BYTES = 256
@@ -39,9 +40,9 @@ _TOTALS = 8192
 _KEPT = 96 * 1024
 """Most bytes of weights that a program keeps; it reads more of them anew for every image."""
 _SUMS = 8192
-"""Most sums for all rows of a window that one program keeps; for more there is a program for each row, except for
-images of four channels, where it has `_MORE`."""
+"""Most sums for all rows of a window that one program keeps; for more there is a program for each row."""
 _MORE = 20480
+"""The same for images of four channels."""
 _SHARED = 200 * 1024
 """Most bytes that a program reads ahead, three steps at once; an H200 has 227 KiB of shared memory."""
 _SUMMING = PROGRAMS // 4
@@ -62,15 +63,15 @@ def convolve(*pairs: jax.Array, geometry: Geometry, interpret: bool = False) -> 
     wide = 2 if filters <= 32 else 1
     one, two = (of_outputs(geometry, channels, filters, (rows, wide), pairs[0].dtype.itemsize) for rows in (1, 2))
     tiles = two if channels > 4 and _keeps(two, geometry.taps, pairs) else one
-    rows = min(_rows(pairs), _TOTALS // (tiles.tile[0] * _columns(tiles)))
-    return _multiply(pairs, geometry.taps, tiles, (filters, 1), rows, "convolve", interpret)
+    count = min(_at_once(pairs), _TOTALS // (tiles.tile[0] * _columns(tiles)))
+    return _multiply(pairs, geometry.taps, tiles, (filters, 1), count, "convolve", interpret)
 
 
 def to_input(*pairs: jax.Array, geometry: Geometry, interpret: bool = False) -> jax.Array:
     """Computes the transpose in x, [T, B, H, W, C], of dy, [T, B, P, Q, F], by W, which is as in `convolve`."""
     channels, filters = pairs[1].shape[3:]
     tiles = of_inputs(geometry, channels, filters)
-    return _multiply(pairs, geometry.taps, tiles, (1, filters), _rows(pairs), "to_input", interpret)
+    return _multiply(pairs, geometry.taps, tiles, (1, filters), _at_once(pairs), "to_input", interpret)
 
 
 def to_kernel(*pairs: jax.Array, geometry: Geometry, interpret: bool = False) -> jax.Array:
@@ -88,7 +89,7 @@ def to_kernel(*pairs: jax.Array, geometry: Geometry, interpret: bool = False) ->
 
 
 def _multiply(
-    pairs: Sequence[jax.Array], taps: int, tiles: Tiles, strides: Pair, rows: int, name: str, interpret: bool
+    pairs: Sequence[jax.Array], taps: int, tiles: Tiles, strides: Pair, count: int, name: str, interpret: bool
 ) -> jax.Array:
     """Multiplies windows by weights: [T, B, rows, columns, channels] that are written.
 
@@ -97,14 +98,14 @@ def _multiply(
         taps: k.
         tiles: what is computed.
         strides: from a channel that is read, and from one that is written, to the next in the kernel's memory.
-        rows: windows that a program multiplies at once.
+        count: windows that a program multiplies at once.
         name: of the operation.
         interpret: run on any device, slowly, for tests.
     """
     (tasks, images), dtype = pairs[0].shape[:2], pairs[0].dtype
     columns, pieces, meetings = _columns(tiles), list(_pieces(tiles, dtype)), _meetings(tiles, taps)
     keeps, sums = _keeps(tiles, taps, pairs), tiles.tile[0] * columns
-    at = places(tiles, images, rows, tasks, PROGRAMS)
+    at = places(tiles, images, count, tasks, PROGRAMS)
     shared = [len(kernel) < tasks for kernel in pairs[1::2]]
     parts = list(itertools.product(range(len(shared)), sorted({row for row, _ in meetings}), pieces))
 
@@ -151,7 +152,8 @@ def _sum_products(pairs: Sequence[jax.Array], tiles: Tiles, interpret: bool) -> 
     alone = not many or (channels <= 4 and sums <= _MORE)  # a program keeps the sums for all rows of a window
     others = tasks if alone else tasks * rows
     count = 64 if many or sums <= _SUMS // 2 else 32
-    at = places(tiles, images, max(_LEAST, count * 2 // dtype.itemsize), others, _SUMMING)
+    count = max(_LEAST, count * 2 // dtype.itemsize)
+    at = places(tiles, images, count, others, _SUMMING)
     there = math.prod(at.grid)
     each = max(1, there * at.chunks * others // PROGRAMS)  # places of a program, so that few sums are left to add
     programs = pl.cdiv(there, each)
@@ -185,7 +187,8 @@ def _sum_products(pairs: Sequence[jax.Array], tiles: Tiles, interpret: bool) -> 
 
     shape = programs * at.chunks, tasks, rows, length * channels, tiles.tile[1] * tiles.written[2]
     grid = programs * (1 if alone else rows), at.chunks, tasks
-    read = len(pairs) // 2 * count * (columns + sums // (columns * (1 if alone else rows))) * dtype.itemsize
+    wide = sum(width for _, width in pieces) * (rows if alone else 1)
+    read = len(pairs) // 2 * count * (columns + wide) * dtype.itemsize
     stages = 3 if many and 3 * read <= _SHARED else 1
     call = _call(program, shape, _wide(dtype), grid, "to_kernel", 4 if many else 2, stages, interpret)
     total = call(*(array.reshape(tasks, -1) for array in pairs)).sum(axis=0)
@@ -284,7 +287,8 @@ def _pieces(tiles: Tiles, dtype: Any, least: int = 2 * _LEAST) -> Iterator[Pair]
         first += width
 
 
-def _rows(pairs: Sequence[jax.Array]) -> int:
+def _at_once(pairs: Sequence[jax.Array]) -> int:
+    """Counts the windows that a program multiplies at once, at most."""
     return _BYTES // pairs[0].dtype.itemsize
 
 

@@ -19,10 +19,11 @@ from jax.experimental.pallas import triton
 from jax.interpreters import ad, batching
 
 from milx.meta.operations import MOST_NUMBERS, PROGRAMS, check_numbers, operation
-from milx.meta.tiles import Pair
 
 _AT_ONCE = 4096
 """Numbers of an image that a program reads at once."""
+Pairs = tuple[tuple[int, int], ...]
+"""Numbers of the images that are multiplied."""
 
 
 def pixel_sums(
@@ -41,8 +42,15 @@ def pixel_sums(
         Both sums, [B, F] each.
 
     Raises:
-        ValueError: for more numbers than 32 bits count.
+        ValueError: for other shapes or types, and for more numbers than 32 bits count.
     """
+    if (u.shape, u.dtype) != (x.shape, x.dtype):
+        raise ValueError(f"u: got {u.dtype}{list(u.shape)}, expected {x.dtype}{list(x.shape)}, as x")
+    expected = (len(x),), (len(x), x.shape[-1])
+    if gate is not None and (gate[0].shape, gate[1].shape) != expected:
+        raise ValueError(
+            f"gate: got shapes {gate[0].shape} and {gate[1].shape}, expected {expected[0]} and {expected[1]}"
+        )
     images, pair = ((x,), (0, 0)) if u is x else ((u, x), (0, 1))
     rows = (image.reshape(len(image), -1, image.shape[-1]) for image in images)
     settings = {"pairs": (pair,), "gate": None if gate is None else pair[1], "interpret": interpret}
@@ -56,7 +64,7 @@ def scale_and_shift(x: jax.Array, scale: jax.Array, shift: jax.Array) -> jax.Arr
     return x * scale.reshape(-1, *between, 1) + shift.reshape(len(shift), *between, -1)
 
 
-def _sum_pixels(*arrays: jax.Array, pairs: tuple[Pair, ...], gate: int | None, interpret: bool) -> jax.Array:
+def _sum_pixels(*arrays: jax.Array, pairs: Pairs, gate: int | None, interpret: bool) -> jax.Array:
     """Computes both sums, [N, 2, F].
 
     Args:
@@ -68,13 +76,13 @@ def _sum_pixels(*arrays: jax.Array, pairs: tuple[Pair, ...], gate: int | None, i
     count, pixels, channels = arrays[0].shape
     columns = pl.next_power_of_2(channels)
     rows = max(1, _AT_ONCE // columns)
-    steps = pl.cdiv(pixels, rows)
-    parts = min(steps, pl.cdiv(PROGRAMS, count))
-    steps = pl.cdiv(steps, parts)
+    every = pl.cdiv(pixels, rows)
+    steps = pl.cdiv(every, min(every, pl.cdiv(PROGRAMS, count)))
+    parts = pl.cdiv(every, steps)
     wide = jnp.promote_types(arrays[0].dtype, jnp.float32)
     check_numbers("pixel_sums", *(array.shape for array in arrays))
     images = len(arrays) - (0 if gate is None else 2)
-    used = sorted({number for pair in pairs for number in pair} | (set() if gate is None else {gate}))
+    used = _used(pairs, gate)
 
     def program(*references: Any) -> None:
         (*read, sums), image, part = references, pl.program_id(0), pl.program_id(1)
@@ -108,12 +116,17 @@ def _sum_pixels(*arrays: jax.Array, pairs: tuple[Pair, ...], gate: int | None, i
     return call(*flat).sum(axis=1)
 
 
+def _used(pairs: Pairs, gate: int | None) -> list[int]:
+    """Lists the numbers of the images that are read."""
+    return sorted({number for pair in pairs for number in pair} | (set() if gate is None else {gate}))
+
+
 def _keep(arrays: Sequence[Any], gate: int | None) -> Any:
     """Computes k: [N, P, F], or 1."""
     return 1 if gate is None else scale_and_shift(arrays[gate], *arrays[-2:]) > 0
 
 
-def _sum_plainly(*arrays: jax.Array, pairs: tuple[Pair, ...], gate: int | None) -> jax.Array:
+def _sum_plainly(*arrays: jax.Array, pairs: Pairs, gate: int | None) -> jax.Array:
     """Computes what `_sum_pixels` does on any device."""
     images = [array.astype(jnp.promote_types(array.dtype, jnp.float32)) for array in arrays]
     sums = images[pairs[0][0]], sum(images[u] * images[v] for u, v in pairs)
@@ -123,24 +136,35 @@ def _sum_plainly(*arrays: jax.Array, pairs: tuple[Pair, ...], gate: int | None) 
 _sums = operation(_sum_pixels, _sum_plainly)
 
 
-def _jvp(primals: Sequence[Any], tangents: Sequence[Any], *, pairs: tuple[Pair, ...], **settings: Any) -> Any:
+def _jvp(
+    primals: Sequence[Any], tangents: Sequence[Any], *, pairs: Pairs, gate: int | None, interpret: bool
+) -> tuple[jax.Array, jax.Array]:
     """Differentiates the products; k is constant but for a few pixels."""
-    gated = 0 if settings["gate"] is None else 2
-    images, gate = list(primals[: len(primals) - gated]), primals[len(primals) - gated :]
+    gated = 0 if gate is None else 2
+    images = list(primals[: len(primals) - gated])
     changes: dict[int, int] = {}
-    first = pairs[0][0]
     for number, tangent in enumerate(tangents[: len(images)]):
-        if number == first or not isinstance(tangent, ad.Zero):
+        if number == pairs[0][0] or not isinstance(tangent, ad.Zero):  # the first sum is that of a tangent
             changes[number] = len(images)
             images.append(ad.instantiate_zeros(tangent))
-    more: list[Pair] = []
+    more: list[tuple[int, int]] = []
     for u, v in pairs:
         more += [(changes[u], v)] if u in changes else []
         more += [(u, changes[v])] if v in changes else []
-    return _sums.bind(*primals, pairs=pairs, **settings), _sums.bind(*images, *gate, pairs=tuple(more), **settings)
+    used = _used(tuple(more), gate)
+    place = {number: index for index, number in enumerate(used)}
+    value = _sums.bind(*primals, pairs=pairs, gate=gate, interpret=interpret)
+    change = _sums.bind(
+        *(images[number] for number in used),
+        *primals[len(primals) - gated :],
+        pairs=tuple((place[u], place[v]) for u, v in more),
+        gate=None if gate is None else place[gate],
+        interpret=interpret,
+    )
+    return value, change
 
 
-def _transpose(gradient: Any, *arrays: Any, pairs: tuple[Pair, ...], gate: int | None, **_: Any) -> list[Any]:
+def _transpose(gradient: Any, *arrays: Any, pairs: Pairs, gate: int | None, **_: Any) -> list[Any]:
     """Computes the gradients by those images that are not known, one of a pair at most."""
     if isinstance(gradient, ad.Zero):
         return [ad.Zero(array.aval) if ad.is_undefined_primal(array) else None for array in arrays]
@@ -148,7 +172,7 @@ def _transpose(gradient: Any, *arrays: Any, pairs: tuple[Pair, ...], gate: int |
     keep = _keep(arrays, gate)
 
     def by(number: int, like: Any) -> jax.Array:
-        total = jnp.broadcast_to(by_one, like.shape) if number == pairs[0][0] else jnp.zeros(like.shape)
+        total = jnp.broadcast_to(by_one, like.shape) if number == pairs[0][0] else jnp.zeros(like.shape, gradient.dtype)
         for u, v in pairs:
             total = total + arrays[v] * by_product if u == number else total
             total = total + arrays[u] * by_product if v == number else total

@@ -45,7 +45,7 @@ def _statistics(
     pixels: int, total: jax.Array, squares: jax.Array, bias: jax.Array, center: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Computes r [B] and s [B, F] from the sums [B, F] over so many pixels."""
-    first, second = (total / pixels).astype(bias.dtype), (squares / pixels).astype(bias.dtype)
+    first, second = total / pixels, squares / pixels
     mean = (first + bias).mean(axis=1)
     square = (second + 2 * bias * first + jnp.square(bias)).mean(axis=1)
     scale = jax.lax.rsqrt(jnp.maximum(square - jnp.square(mean), 0.0) + 1e-6)
@@ -54,14 +54,13 @@ def _statistics(
 
 def _backward(_: Any, interpret: bool, kept: tuple, gradient: jax.Array) -> tuple[jax.Array, ...]:
     x, *small = kept
-    wide = small[-1].dtype
     gate, transpose = jax.vjp(functools.partial(_statistics, x.shape[1] * x.shape[2]), *small)
     given = gradient.astype(x.dtype)
     by_shift, by_scale = pixel_sums(given, x, gate, interpret)
-    by_total, by_squares, by_bias, by_center = transpose((by_scale.sum(axis=1).astype(wide), by_shift.astype(wide)))
+    by_statistics = by_scale.sum(axis=1).astype(gate[0].dtype), by_shift.astype(gate[1].dtype)
+    by_total, by_squares, by_bias, by_center = transpose(by_statistics)
     passed = jnp.where(scale_and_shift(x, *gate) > 0, given, 0)
-    per_image, per_channel = gate[0][:, None, None, None], lambda sums: sums[:, None, None]
-    by_x = passed * per_image + per_channel(by_total) + 2 * x * per_channel(by_squares)
+    by_x = passed * gate[0][:, None, None, None] + by_total[:, None, None] + 2 * x * by_squares[:, None, None]
     return by_x.astype(x.dtype), by_bias, by_center
 
 

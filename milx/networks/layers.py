@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 
 from milx.meta.convolution import conv2d
+from milx.meta.operations import MOST_NUMBERS
 
 
 def positions(height: int, width: int) -> jax.Array:
@@ -46,6 +47,23 @@ def layer_norm(x: jax.Array) -> jax.Array:
     mean, square = x.mean(axes, keepdims=True), jnp.square(x).mean(axes, keepdims=True)
     variance = jnp.maximum(square - jnp.square(mean), 0.0)
     return (x - mean) * jax.lax.rsqrt(variance + 1e-6)
+
+
+def biased_norm(x: jax.Array, bias: jax.Array, center: jax.Array) -> jax.Array:
+    """Computes layer_norm(x + bias) + center for images [B, H, W, F], in the type of the bias [F]."""
+    return layer_norm(x.astype(bias.dtype) + bias) + center
+
+
+def norm_relu(x: jax.Array, bias: jax.Array, center: jax.Array, dtype: jnp.dtype) -> jax.Array:
+    """Computes relu(biased_norm(x, bias, center)) as `dtype`, on a GPU by `channel_norm.normalize`.
+
+    That cannot be differentiated forward alone, and 32 bits must count its numbers.
+    """
+    if jax.default_backend() == "gpu" and x.size <= MOST_NUMBERS:
+        from milx.networks.channel_norm import normalize  # Pallas takes a quarter of a second to import
+
+        return normalize(x, bias, center, dtype)
+    return nn.relu(biased_norm(x, bias, center)).astype(dtype)
 
 
 class Conv(nn.Module):
@@ -94,12 +112,9 @@ class ConvBlock(nn.Module):
         center = self.param("centre", nn.initializers.zeros, (self.filters,))
         dtype = jnp.bfloat16 if self.mixed_precision else kernel.dtype
         x = conv2d(x.astype(dtype), kernel.astype(dtype), self.stride)
-        if jax.default_backend() == "gpu" and skip is None:
-            from milx.networks.channel_norm import normalize  # Pallas takes a quarter of a second to import
-
-            return normalize(x, bias, center, dtype)
-        x = layer_norm(x.astype(bias.dtype) + bias) + center
-        return nn.relu(x if skip is None else x + skip).astype(dtype)
+        if skip is None:
+            return norm_relu(x, bias, center, dtype)
+        return nn.relu(biased_norm(x, bias, center) + skip).astype(dtype)
 
 
 class FixedConv(nn.Module):

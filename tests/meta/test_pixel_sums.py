@@ -76,6 +76,40 @@ def test_other_devices_sum_by_xla(rng, gated):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-10), found, plainly(u, x, gate))
 
 
+@pytest.mark.parametrize("interpret", [False, True])
+def test_bfloat16_is_summed_in_float32(rng, interpret):
+    u, x = (jnp.asarray(rng.random((2, 63, 61, 3)), jnp.bfloat16) for _ in range(2))
+    for found, expected in zip(pixel_sums(u, x, interpret=interpret), plainly(*map(np.float64, (u, x))), strict=True):
+        assert found.dtype == jnp.float32
+        np.testing.assert_allclose(found, expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("by_u", [False, True])
+def test_derivatives_in_one_image_alone(rng, by_u):
+    """The tangent of the other is zero."""
+    u, x, direction = (jnp.asarray(rng.standard_normal((2, 3, 4, 5))) for _ in range(3))
+    gate = jnp.asarray(rng.standard_normal(2)), jnp.asarray(rng.standard_normal((2, 5)))
+    found, expected = (
+        jax.jvp(lambda a, by=by: by(*((a, x) if by_u else (u, a)), gate), (u if by_u else x,), (direction,))
+        for by in (functools.partial(pixel_sums, interpret=True), plainly)
+    )
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-10), found, expected)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"u": np.zeros((2, 4, 4, 5))}, r"u: got float64\[2, 4, 4, 5\], expected float64\[2, 2, 2, 5\]"),
+        ({"u": np.zeros((2, 2, 2, 5), np.float32)}, "u: got float32"),
+        ({"gate": (np.zeros(2), np.zeros(5))}, r"gate: got shapes \(2,\) and \(5,\), expected \(2,\) and \(2, 5\)"),
+    ],
+)
+def test_other_shapes_and_types_are_refused(change, message):
+    inputs = {"u": np.zeros((2, 2, 2, 5)), "x": np.zeros((2, 2, 2, 5)), **change}
+    with pytest.raises(ValueError, match=message):
+        pixel_sums(**inputs, interpret=True)
+
+
 def test_more_numbers_than_32_bits_count_are_refused():
     x = jax.ShapeDtypeStruct((2**15, 256, 256, 1), jnp.bfloat16)
     with pytest.raises(ValueError, match="pixel_sums: got an array of 2147483648 numbers, expected at most"):

@@ -1,5 +1,6 @@
 """Convolutions by kernels of a GPU, interpreted, against `jax.lax`."""
 
+import functools
 import re
 
 import jax
@@ -11,10 +12,12 @@ from lax_convolution import all_derivatives, assert_agree, reference_conv2d
 
 from milx.meta import kernels, operations, task_convolution
 from milx.meta.task_convolution import convolve_directly
+from milx.meta.tiles import Geometry
 
 # Images, height, width, channels, filters, kernel and stride.
 SHAPES = {
     "three channels": (2, 9, 11, 3, 5, 5, 2),
+    "tiles of four outputs": (2, 9, 11, 3, 16, 5, 2),
     "rows of several pieces": (1, 6, 7, 16, 4, 5, 3),
     "many filters": (1, 5, 6, 8, 33, 3, 2),
     "several images at once, and a rest": (5, 3, 4, 4, 3, 3, 1),
@@ -41,10 +44,13 @@ def test_value_and_derivatives_are_those_of_lax(rng, shape):
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "images"), [("_KEPT", 0, 6), ("_SUMS", 0, 7), ("PROGRAMS", 1, 8), ("_SUMMING", 64, 9)]
+    ("name", "value", "images"),
+    [("_KEPT", 0, 6), ("_SUMS", 0, 7), ("PROGRAMS", 1, 8), ("_SUMMING", 64, 9), ("_TOTALS", 512, 10)],
 )
 def test_programs_may_keep_less_and_share_more(rng, monkeypatch, name, value, images):
     """Keeps no weights, has the sums for one row of windows, or for all places, or shares images among programs.
+
+    With few sums in all, fewer windows are multiplied at once.
 
     Each has a number of images of its own, since JAX keeps what it has traced.
     """
@@ -139,3 +145,22 @@ def test_sizes_that_the_kernels_cannot_have_are_refused(images, channels, messag
     kernel = jax.ShapeDtypeStruct((3, 3, channels, 8), jnp.float32)
     with pytest.raises(ValueError, match=message):
         jax.eval_shape(lambda x, kernel: directly(x, kernel, 2), x, kernel)
+
+
+@pytest.mark.parametrize(("channels", "filters", "stride"), [(4, 16, 2), (64, 64, 1)])
+def test_programs_read_ahead_what_shared_memory_holds(monkeypatch, channels, filters, stride):
+    """With one pair of images three steps fit into an H200's 227 KiB, with two they do not."""
+    stages = []
+
+    def record(program, shape, dtype, *settings):
+        stages.append(settings[-2])
+        return lambda *arrays: jnp.zeros(shape, dtype)
+
+    monkeypatch.setattr(kernels, "_call", record)
+    size = 40, 40
+    geometry = Geometry(stride, 5, (2, 2), size, tuple(-(-length // stride) for length in size))
+    x = jax.ShapeDtypeStruct((2, 8, *size, channels), jnp.bfloat16)
+    dy = jax.ShapeDtypeStruct((2, 8, *geometry.shape, filters), jnp.bfloat16)
+    for pairs in (1, 2):
+        jax.eval_shape(functools.partial(kernels.to_kernel, geometry=geometry), *([x, dy] * pairs))
+    assert stages == [3, 1]

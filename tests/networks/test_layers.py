@@ -136,10 +136,21 @@ def test_a_block_by_kernels_of_a_gpu_is_that_of_a_cpu(rng, monkeypatch, skips):
         loss = lambda params: jnp.sum(weights * block.apply(params, x, skip))  # noqa: E731
         return jax.value_and_grad(loss)(params)
 
-    expected = derivatives()
+    expected, calls = derivatives(), []
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     for module, name in ((task_convolution, "convolve_directly"), (channel_norm, "normalize")):
-        monkeypatch.setattr(module, name, functools.partial(getattr(module, name), interpret=True))
+        interpreted = functools.partial(getattr(module, name), interpret=True)
+        monkeypatch.setattr(module, name, lambda *args, of=name, by=interpreted: calls.append(of) or by(*args))
     for found, wanted in zip(jax.tree.leaves(derivatives()), jax.tree.leaves(expected), strict=True):
         assert found.dtype == wanted.dtype
         np.testing.assert_allclose(found, wanted, rtol=0, atol=2**-6 * np.abs(wanted).max())
+    assert calls == ["convolve_directly"] + ([] if skips else ["normalize"])
+
+
+def test_more_numbers_than_32_bits_count_are_normalized_plainly(rng, monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(layers, "MOST_NUMBERS", 100)
+    monkeypatch.setattr(channel_norm, "normalize", None)
+    x, bias, center = (jnp.asarray(rng.standard_normal(shape)) for shape in ((2, 5, 6, 4), (4,), (4,)))
+    expected = jax.nn.relu(layers.layer_norm(x + bias) + center)
+    np.testing.assert_allclose(layers.norm_relu(x, bias, center, float), expected, atol=1e-12)
