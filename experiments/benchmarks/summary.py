@@ -80,8 +80,8 @@ def _ratio(question: Question, row: Row) -> str:
         return ""
     both = zip(ours.get("runs", ()), row.get("runs", ()), strict=True)
     runs = [factor(*pair, question.unit) for pair in both if None not in pair]
-    spread = f" ({min(runs):.3g} to {max(runs):.3g})" if len(runs) > 1 else ""
-    return f"{factor(ours['median'], row['median'], question.unit):.3g}{spread}"
+    spread = f" ({_short(min(runs))} to {_short(max(runs))})" if len(runs) > 1 else ""
+    return f"{_short(factor(ours['median'], row['median'], question.unit))}{spread}"
 
 
 def number(row: Row) -> str:
