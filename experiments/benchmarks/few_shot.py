@@ -6,8 +6,9 @@
 All compute the meta-gradient of MAML (Finn et al. 2017) with one or five inner steps, of the same random images: five
 classes, one image of each to adapt to and 15 to be judged by. The network is MAML's, with max-pooling for both sizes:
 four blocks of a convolution, batch normalization, ReLU and max-pooling, and a linear layer. On a CPU milx works on one
-task at a time. float32, in which GPUs may multiply in TF32. A row's note says by how much its gradient differs from
-milx's, relative to its norm; torch.func's differs in double precision, too. The peers are installed by
+task at a time. In float32, in which GPUs may multiply in TF32, and on GPUs in bfloat16, too: then all convolve so, and
+normalize in float32. A row's note says by how much its gradient differs from milx's, relative to its norm;
+torch.func's differs in double precision, too. The peers are installed by
 `pip install jaxopt higher torchopt graphviz`; learn2learn, which loops over tasks, does not install on Python 3.12.
 """
 
@@ -16,6 +17,7 @@ import os
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # PyTorch needs memory in the same process
 
 import functools
+import itertools
 import pathlib
 import statistics
 import time
@@ -63,10 +65,10 @@ def make_tasks(network: str, count: int) -> tuple[np.ndarray, ...]:
     return tuple(tasks)
 
 
-def loss(convolve: Convolution, params: Params, x: jax.Array, y: jax.Array) -> jax.Array:
-    """Computes the mean cross-entropy of images [B, H, W, C] and labels [B]."""
+def loss(convolve: Convolution, dtype: str, params: Params, x: jax.Array, y: jax.Array) -> jax.Array:
+    """Computes the mean cross-entropy of images [B, H, W, C] and labels [B]; convolves in a type."""
     for i in range(BLOCKS):
-        x = convolve(x, params[f"kernel{i}"], 1) + params[f"bias{i}"]
+        x = convolve(x.astype(dtype), params[f"kernel{i}"].astype(dtype), 1) + params[f"bias{i}"]
         mean = x.mean((0, 1, 2))
         variance = jnp.square(x - mean).mean((0, 1, 2))
         x = (x - mean) * (jax.lax.rsqrt(variance + 1e-5) * params[f"scale{i}"]) + params[f"shift{i}"]
@@ -78,9 +80,9 @@ def loss(convolve: Convolution, params: Params, x: jax.Array, y: jax.Array) -> j
     return -jnp.take_along_axis(jax.nn.log_softmax(logits), y[:, None], 1).mean()
 
 
-def by_milx(params: Params, tasks: tuple[jax.Array, ...], steps: int) -> Params:
+def by_milx(params: Params, tasks: tuple[jax.Array, ...], steps: int, dtype: str) -> Params:
     """Computes the meta-gradient with milx."""
-    inner = functools.partial(loss, meta.conv2d)
+    inner = functools.partial(loss, meta.conv2d, dtype)
 
     def task_loss(params: Params, task: tuple[jax.Array, ...]) -> jax.Array:
         adapted = meta.adapt(inner, params, *task[:2], steps=steps, rate=RATE)
@@ -89,9 +91,9 @@ def by_milx(params: Params, tasks: tuple[jax.Array, ...], steps: int) -> Params:
     return meta.meta_gradient(task_loss, params, tasks, at_once=None if common.accelerated() else 1)[0]
 
 
-def by_jax(params: Params, tasks: tuple[jax.Array, ...], steps: int) -> Params:
+def by_jax(params: Params, tasks: tuple[jax.Array, ...], steps: int, dtype: str) -> Params:
     """Computes the meta-gradient as one would write it first."""
-    inner = functools.partial(loss, common.lax_convolution)
+    inner = functools.partial(loss, common.lax_convolution, dtype)
 
     def task_loss(params: Params, x: jax.Array, y: jax.Array, query: jax.Array, wanted: jax.Array) -> jax.Array:
         for _ in range(steps):
@@ -102,11 +104,11 @@ def by_jax(params: Params, tasks: tuple[jax.Array, ...], steps: int) -> Params:
     return jax.grad(lambda params: of_tasks(params, *tasks).mean())(params)
 
 
-def by_jaxopt(params: Params, tasks: tuple[jax.Array, ...], steps: int) -> Params:
+def by_jaxopt(params: Params, tasks: tuple[jax.Array, ...], steps: int, dtype: str) -> Params:
     """Computes the meta-gradient with jaxopt (Blondel et al. 2022), through its unrolled gradient descent."""
     import jaxopt
 
-    inner = functools.partial(loss, common.lax_convolution)
+    inner = functools.partial(loss, common.lax_convolution, dtype)
     options = {"maxiter": steps, "tol": 0.0, "acceleration": False, "implicit_diff": False, "unroll": True}
     solver = jaxopt.GradientDescent(inner, stepsize=RATE, **options)
 
@@ -117,10 +119,12 @@ def by_jaxopt(params: Params, tasks: tuple[jax.Array, ...], steps: int) -> Param
     return jax.grad(lambda params: of_tasks(params, *tasks).mean())(params)
 
 
-def measure_jax(by: Callable[..., Params], network: str, count: int, steps: int) -> tuple[float, float, Params]:
+def measure_jax(
+    by: Callable[..., Params], network: str, count: int, steps: int, dtype: str
+) -> tuple[float, float, Params]:
     """Measures the median ms and GiB of a meta-gradient in JAX, and returns it."""
     params, tasks = jax.tree.map(jnp.asarray, (make_params(network), make_tasks(network, count)))
-    compiled = jax.jit(by, static_argnums=2).lower(params, tasks, steps).compile()
+    compiled = jax.jit(by, static_argnums=(2, 3)).lower(params, tasks, steps, dtype).compile()
     return (
         median_ms(lambda: jax.block_until_ready(compiled(params, tasks))),
         common.gib(compiled),
@@ -128,7 +132,7 @@ def measure_jax(by: Callable[..., Params], network: str, count: int, steps: int)
     )
 
 
-def measure_torch(name: str, network: str, count: int, steps: int) -> tuple[float, float | None, Params]:
+def measure_torch(name: str, network: str, count: int, steps: int, dtype: str) -> tuple[float, float | None, Params]:
     """Measures the median ms and, on a GPU, the peak GiB of a meta-gradient in PyTorch, and returns it."""
     import few_shot_torch
     import torch
@@ -150,7 +154,8 @@ def measure_torch(name: str, network: str, count: int, steps: int) -> tuple[floa
     by = few_shot_torch.PEERS[name]
 
     def call() -> Any:
-        found = by(params, tasks, steps, RATE)
+        with torch.autocast("cuda" if gpu else "cpu", torch.bfloat16, enabled=dtype == "bfloat16"):
+            found = by(params, tasks, steps, RATE)
         if gpu:
             torch.cuda.synchronize()
         return found
@@ -186,8 +191,8 @@ def difference(found: Params, reference: Params) -> float:
     return float(np.sqrt(sum(d for d, _ in squares) / sum(n for _, n in squares)))
 
 
-def measure(report: common.Report, network: str, steps: int, count: int, peers: list[str]) -> None:
-    """Adds the rows of a network, a number of inner steps and a number of tasks."""
+def measure(report: common.Report, network: str, steps: int, count: int, dtype: str, peers: list[str]) -> None:
+    """Adds the rows of a network, a number of inner steps and a number of tasks, in a type."""
     reference: dict[str, Any] = {}
     case = f"{steps} step{'s' * (steps > 1)}, {count} tasks"
     jaxes = {"milx": by_milx, "JAX, vmap over lax.conv": by_jax, "jaxopt": by_jaxopt}
@@ -196,9 +201,9 @@ def measure(report: common.Report, network: str, steps: int, count: int, peers: 
 
         def run(name: str = name) -> tuple[float, float | None]:
             found = (
-                measure_jax(jaxes[name], network, count, steps)
+                measure_jax(jaxes[name], network, count, steps, dtype)
                 if name in jaxes
-                else measure_torch(name, network, count, steps)
+                else measure_torch(name, network, count, steps, dtype)
             )
             if name == "milx":
                 reference["gradient"] = found[2]
@@ -217,11 +222,14 @@ def main(_: list[str]) -> None:
     """Measures and writes the JSON files."""
     milx.configure()
     accelerated = common.accelerated()
-    for network in _NETWORKS.value or (list(NETWORKS) if accelerated else ["omniglot"]):
-        report = common.Report(f"few_shot-{network}", pathlib.Path(_OUT.value))
+    networks = _NETWORKS.value or (list(NETWORKS) if accelerated else ["omniglot"])
+    types = _TYPES.value or (["float32", "bfloat16"] if accelerated else ["float32"])
+    for network, dtype in itertools.product(networks, types):
+        name = f"few_shot-{network}" if dtype == "float32" else f"few_shot-{network}-{dtype}"
+        report = common.Report(name, pathlib.Path(_OUT.value))
         for steps in map(int, _STEPS.value):
             for count in map(int, _TASKS.value or (("4", "64") if accelerated else ("4",))):
-                measure(report, network, steps, count, _PEERS.value)
+                measure(report, network, steps, count, dtype, _PEERS.value)
 
 
 if __name__ == "__main__":
@@ -238,6 +246,12 @@ if __name__ == "__main__":
     _OUT = flags.DEFINE_string("out", str(common.RESULTS), "Folder of the JSON files.")
     _NETWORKS = flags.DEFINE_multi_enum(
         "networks", None, list(NETWORKS), "Which; all, or Omniglot's on a CPU, by default (repeat the flag)."
+    )
+    _TYPES = flags.DEFINE_multi_enum(
+        "types",
+        None,
+        ["float32", "bfloat16"],
+        "In which types; both, or float32 on a CPU, by default (repeat the flag).",
     )
     _TASKS = flags.DEFINE_list("tasks", None, "Numbers of tasks; 4 and 64, or 4 on a CPU, by default.")
     _STEPS = flags.DEFINE_list("steps", ["1", "5"], "Numbers of inner steps.")
