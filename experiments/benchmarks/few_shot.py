@@ -142,9 +142,10 @@ def measure_torch(name: str, network: str, count: int, steps: int, dtype: str) -
     torch.backends.cudnn.benchmark = True
 
     def tensor(x: np.ndarray) -> Any:
-        x = np.moveaxis(x, -1, -3) if x.ndim == 5 else x.transpose(3, 2, 0, 1) if x.ndim == 4 else x
+        images = x.ndim == 5
+        x = np.moveaxis(x, -1, -3) if images else x.transpose(3, 2, 0, 1) if x.ndim == 4 else x
         made = torch.from_numpy(np.ascontiguousarray(x))
-        made = made if made.is_floating_point() else made.long()
+        made = made.to(getattr(torch, dtype)) if images else made if made.is_floating_point() else made.long()
         return made.cuda() if gpu else made
 
     side = NETWORKS[network][0] >> BLOCKS
@@ -154,8 +155,7 @@ def measure_torch(name: str, network: str, count: int, steps: int, dtype: str) -
     by = few_shot_torch.PEERS[name]
 
     def call() -> Any:
-        with torch.autocast("cuda" if gpu else "cpu", torch.bfloat16, enabled=dtype == "bfloat16"):
-            found = by(params, tasks, steps, RATE)
+        found = by(params, tasks, steps, RATE)
         if gpu:
             torch.cuda.synchronize()
         return found

@@ -1,7 +1,7 @@
 """The meta-step of `few_shot.py` in PyTorch: written out, with torch.func, and by libraries for meta-learning.
 
 Parameters are dictionaries as there, with kernels [F, C, 3, 3], and the rows of the last layer in the order of features
-[C, H, W]; images are [N, B, C, H, W].
+[C, H, W]; images are [N, B, C, H, W], in the type of the convolutions.
 """
 
 from collections.abc import Callable
@@ -19,8 +19,10 @@ BLOCKS = 4
 
 def predict(params: Params, x: torch.Tensor) -> torch.Tensor:
     """Computes the logits [B, classes] of images [B, C, H, W]."""
+    dtype = x.dtype
     for i in range(BLOCKS):
-        x = functional.conv2d(x, params[f"kernel{i}"], params[f"bias{i}"], padding=1)
+        kernel, bias = params[f"kernel{i}"].to(dtype), params[f"bias{i}"].to(dtype)
+        x = functional.conv2d(x.to(dtype), kernel, bias, padding=1).float()
         x = functional.batch_norm(x, None, None, params[f"scale{i}"], params[f"shift{i}"], training=True, eps=1e-5)
         x = functional.max_pool2d(functional.relu(x), 2)
     return x.flatten(1) @ params["last"] + params["last_bias"]
