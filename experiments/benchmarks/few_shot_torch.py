@@ -1,7 +1,7 @@
 """The meta-step of `few_shot.py` in PyTorch: written out, with torch.func, and by libraries for meta-learning.
 
 Parameters are dictionaries as there, with kernels [F, C, 3, 3], and the rows of the last layer in the order of features
-[C, H, W]; images are [N, B, C, H, W], in the type of the convolutions.
+[C, H, W]; images are [N, B, C, H, W], in the type of the convolutions, in which biases are added, too.
 """
 
 from collections.abc import Callable
@@ -22,7 +22,7 @@ def predict(params: Params, x: torch.Tensor) -> torch.Tensor:
     dtype = x.dtype
     for i in range(BLOCKS):
         kernel, bias = params[f"kernel{i}"].to(dtype), params[f"bias{i}"].to(dtype)
-        x = functional.conv2d(x.to(dtype), kernel, bias, padding=1).float()
+        x = functional.conv2d(x.to(dtype), kernel, bias, padding=1).to(params[f"scale{i}"].dtype)
         x = functional.batch_norm(x, None, None, params[f"scale{i}"], params[f"shift{i}"], training=True, eps=1e-5)
         x = functional.max_pool2d(functional.relu(x), 2)
     return x.flatten(1) @ params["last"] + params["last_bias"]
