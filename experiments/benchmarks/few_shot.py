@@ -142,11 +142,12 @@ def measure_torch(name: str, network: str, count: int, steps: int, dtype: str) -
     torch.backends.cudnn.benchmark = True
 
     def tensor(x: np.ndarray) -> Any:
-        images = x.ndim == 5
-        x = np.moveaxis(x, -1, -3) if images else x.transpose(3, 2, 0, 1) if x.ndim == 4 else x
-        made = torch.from_numpy(np.ascontiguousarray(x))
-        made = made.to(getattr(torch, dtype)) if images else made if made.is_floating_point() else made.long()
-        return made.cuda() if gpu else made
+        made = torch.from_numpy(x).to("cuda" if gpu else "cpu")
+        if x.ndim == 5:  # images
+            return made.movedim(-1, -3).contiguous().to(getattr(torch, dtype))
+        if x.ndim == 4:  # kernels
+            return made.permute(3, 2, 0, 1).contiguous()
+        return made if made.is_floating_point() else made.long()
 
     side = NETWORKS[network][0] >> BLOCKS
     params, tasks = jax.tree.map(tensor, (make_params(network), make_tasks(network, count)))
