@@ -85,7 +85,7 @@ def by_milx(params: Params, tasks: tuple[jax.Array, ...], steps: int, dtype: str
     inner = functools.partial(loss, meta.conv2d, dtype)
 
     def task_loss(params: Params, task: tuple[jax.Array, ...]) -> jax.Array:
-        adapted = meta.adapt(inner, params, *task[:2], steps=steps, rate=RATE)
+        adapted = meta.adapt(inner, params, *task[:2], steps=steps, rate=RATE, unroll=steps)
         return inner(adapted, *task[2:])
 
     return meta.meta_gradient(task_loss, params, tasks, at_once=None if common.accelerated() else 1)[0]

@@ -130,6 +130,7 @@ def adapt(
     mask: Any = True,
     order: str = ORDERS[0],
     path: bool = False,
+    unroll: int = 1,
 ) -> Any:
     """Takes K steps of gradient descent, in a scan if there are several; it can be differentiated in reverse.
 
@@ -143,12 +144,17 @@ def adapt(
         mask: as in `inner_step`.
         order: one of ORDERS.
         path: return theta_1 to theta_K, with a leading axis [K], instead of theta_K.
+        unroll: number of steps in an iteration of the scan, as in `jax.lax.scan`. With K of them no loop is left, which
+            takes longer to compile and more memory, but may be faster where a step is short.
 
     Raises:
-        ValueError: as `inner_step`; for a negative number of steps, or a rate that is neither a scalar nor [K].
+        ValueError: as `inner_step`; for a negative number of steps, a rate that is neither a scalar nor [K], or less
+            than one step in an iteration.
     """
     if steps < 0:
         raise ValueError(f"steps: got {steps}, expected at least 0")
+    if unroll < 1:
+        raise ValueError(f"unroll: got {unroll}, expected at least 1")
     params = jax.tree.map(jnp.asarray, params)
     rates = jax.tree.map(lambda rate: _for_every_step(rate, steps), _for_every_tensor("rate", rate, params))
 
@@ -159,7 +165,7 @@ def adapt(
     if steps == 1:  # a loop of one step would be slower to compile
         last, _ = take(params, jax.tree.map(lambda rate: rate[0], rates))
         return jax.tree.map(lambda x: x[None], last) if path else last
-    last, visited = jax.lax.scan(take, params, rates, length=steps)
+    last, visited = jax.lax.scan(take, params, rates, length=steps, unroll=unroll)
     return visited if path else last
 
 

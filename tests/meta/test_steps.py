@@ -158,6 +158,21 @@ def test_a_path_has_the_parameters_after_every_step(steps):
     np.testing.assert_allclose(found, np.reshape(each, (steps, 4)), rtol=1e-12)
 
 
+@pytest.mark.parametrize("path", [False, True])
+def test_unrolled_steps_are_the_same_without_a_loop(path):
+    """Compares values and the derivative with those of a scan, in which XLA sees a loop."""
+
+    def adapted(theta, unroll):
+        return meta.adapt(bowl, theta, CENTER, steps=3, rate=RATE, path=path, unroll=unroll)
+
+    derivative = jax.jit(jax.jacrev(adapted), static_argnums=1)
+    looped, unrolled = derivative.lower(START, 1), derivative.lower(START, 3)
+    assert "stablehlo.while" in looped.as_text()
+    assert "stablehlo.while" not in unrolled.as_text()
+    np.testing.assert_allclose(adapted(START, 3), adapted(START, 1), rtol=1e-12)
+    np.testing.assert_allclose(unrolled.compile()(START), looped.compile()(START), rtol=1e-12)
+
+
 @pytest.mark.parametrize("order", ORDERS)
 def test_only_reverse_over_reverse_differentiates_by_data(order):
     adapted = lambda center: meta.adapt(bowl, START, center, steps=1, rate=RATE, order=order).sum()  # noqa: E731
@@ -182,6 +197,7 @@ def test_forward_over_reverse_keeps_nothing_of_the_inner_step():
     ("settings", "message"),
     [
         ({"steps": -1, "rate": 0.1}, "steps: got -1, expected at least 0"),
+        ({"steps": 2, "rate": 0.1, "unroll": 0}, "unroll: got 0, expected at least 1"),
         ({"steps": 2, "rate": np.ones(3)}, r"rate: got the shape \(3,\), expected a scalar or 2 steps"),
         ({"steps": 1, "rate": 0.1, "order": "second"}, "order: got 'second', expected one of forward_over_reverse, "),
         (
