@@ -6,9 +6,9 @@
 All compute the meta-gradient of MAML (Finn et al. 2017) with one or five inner steps, of the same random images: five
 classes, one image of each to adapt to and 15 to be judged by. The network is MAML's, with max-pooling for both sizes:
 four blocks of a convolution, batch normalization, ReLU and max-pooling, and a linear layer. On a CPU milx works on one
-task at a time. In float32, in which GPUs may multiply in TF32, and on GPUs in bfloat16, too: then all convolve so, and
-normalize in float32. A row's note says by how much its gradient differs from milx's, relative to its norm;
-torch.func's differs in double precision, too. The peers are installed by
+task at a time. Its steps are unrolled, as JAX's and torch.func's are. In float32, in which GPUs may multiply in TF32,
+and on GPUs in bfloat16, too: then all convolve so, and normalize in float32. A row's note says by how much its gradient
+differs from milx's, relative to its norm; torch.func's differs in double precision, too. The peers are installed by
 `pip install jaxopt higher torchopt graphviz`; learn2learn, which loops over tasks, does not install on Python 3.12.
 """
 
@@ -85,7 +85,7 @@ def by_milx(params: Params, tasks: tuple[jax.Array, ...], steps: int, dtype: str
     inner = functools.partial(loss, meta.conv2d, dtype)
 
     def task_loss(params: Params, task: tuple[jax.Array, ...]) -> jax.Array:
-        adapted = meta.adapt(inner, params, *task[:2], steps=steps, rate=RATE, unroll=steps)
+        adapted = meta.adapt(inner, params, *task[:2], steps=steps, rate=RATE, unroll=max(steps, 1))
         return inner(adapted, *task[2:])
 
     return meta.meta_gradient(task_loss, params, tasks, at_once=None if common.accelerated() else 1)[0]
@@ -105,7 +105,7 @@ def by_jax(params: Params, tasks: tuple[jax.Array, ...], steps: int, dtype: str)
 
 
 def by_jaxopt(params: Params, tasks: tuple[jax.Array, ...], steps: int, dtype: str) -> Params:
-    """Computes the meta-gradient with jaxopt (Blondel et al. 2022), through its unrolled gradient descent."""
+    """Computes the meta-gradient with jaxopt (Blondel et al. 2022), whose gradient descent scans all but one step."""
     import jaxopt
 
     inner = functools.partial(loss, common.lax_convolution, dtype)

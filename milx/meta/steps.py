@@ -144,8 +144,8 @@ def adapt(
         mask: as in `inner_step`.
         order: one of ORDERS.
         path: return theta_1 to theta_K, with a leading axis [K], instead of theta_K.
-        unroll: number of steps in an iteration of the scan, as in `jax.lax.scan`. With K of them no loop is left, which
-            takes longer to compile and more memory, but may be faster where a step is short.
+        unroll: number of steps in an iteration of the scan, at least 1. With K or more no loop is left, which may be
+            faster, but takes longer to compile and more memory.
 
     Raises:
         ValueError: as `inner_step`; for a negative number of steps, a rate that is neither a scalar nor [K], or less
