@@ -160,8 +160,8 @@ def test_a_path_has_the_parameters_after_every_step(steps):
 
 @pytest.mark.parametrize("path", [False, True])
 @pytest.mark.parametrize(("unroll", "loops"), [(2, True), (3, False), (5, False)])
-def test_unrolled_steps_are_the_same_without_a_loop(path, unroll, loops):
-    """Compares values and the derivative with those of a scan, in which XLA sees a loop."""
+def test_unrolled_steps_are_the_same_and_leave_no_loop_if_all_are(path, unroll, loops):
+    """Compares three steps and their derivative with those of a scan, in which XLA sees a loop."""
 
     def adapted(theta, unroll):
         return meta.adapt(bowl, theta, CENTER, steps=3, rate=RATE, path=path, unroll=unroll)
