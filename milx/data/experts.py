@@ -1,4 +1,4 @@
-"""Which expert demonstrates, by a run's settings, and the plans with which an expert by sampling begins."""
+"""Which expert demonstrates, by a run's settings, and what some experts find before they demonstrate."""
 
 import dataclasses
 import functools
@@ -14,30 +14,33 @@ from milx.config.schema import DataConfig
 from milx.core import platform, pytrees
 from milx.core.messages import warn
 from milx.envs.base import Env
-from milx.trajopt import expert, receding
+from milx.trajopt import expert, learned, receding
 from milx.trajopt.demonstrations import find_plans, no_plans, share_plans
-from milx.trajopt.expert import Sampling
+from milx.trajopt.expert import Learned, Sampling
 from milx.trajopt.ilqr import Options
 from milx.trajopt.planner import Plans, Settings
 
-EXPERTS = ("ilqr", "sampling", "receding")
+EXPERTS = ("ilqr", "sampling", "receding", "ppo")
 SETTINGS = Settings()
 """Of experts that plan whole episodes by sampling."""
 RECEDING = receding.Settings()
 """Of experts with a receding horizon."""
+LEARNED = learned.Settings()
+"""Of experts that learn by policy optimization."""
 
 
-def expert_of(env: Env, config: DataConfig) -> Options | Sampling | receding.Settings:
+def expert_of(env: Env, config: DataConfig) -> Options | Sampling | Learned | receding.Settings:
     """Returns the expert that a run's settings ask for.
 
     The first expert that plans whole episodes of an environment by sampling searches for plans with which others begin,
     under the same noise, lets these scenes begin again with each other's plans, in rounds, and keeps the plans in the
     user's cache.
 
-    It says so if fewer than half of these plans succeed.
+    It says so if fewer than half of these plans succeed. The first expert by policy optimization learns, under the same
+    noise, and is kept there, too.
 
     Raises:
-        ValueError: for another name than those of EXPERTS, or sampling without an iteration.
+        ValueError: for another name than those of EXPERTS, or no iterations of any but iLQR.
     """
     _check(config)
     if config.expert == "ilqr":
@@ -45,6 +48,9 @@ def expert_of(env: Env, config: DataConfig) -> Options | Sampling | receding.Set
     if config.expert == "receding":
         search = dataclasses.replace(RECEDING.search, iterations=config.plan_iterations)
         return dataclasses.replace(RECEDING, search=search)
+    if config.expert == "ppo":
+        settings = dataclasses.replace(LEARNED, iterations=config.plan_iterations)
+        return Learned(settings, _actor(env, settings, config.noise))
     search = dataclasses.replace(SETTINGS.search, iterations=config.plan_iterations)
     return Sampling(
         dataclasses.replace(SETTINGS, search=search), _plans(env, SETTINGS, config.noise, config.plan_batch)
@@ -62,6 +68,7 @@ def description(env: Env, config: DataConfig) -> list:
         "ilqr": [],
         "sampling": ["sampling", repr(SETTINGS)],
         "receding": ["receding", repr(RECEDING), env.ahead],
+        "ppo": ["ppo", repr(LEARNED)],
     }
     return [config.noise, config.plan_iterations, *settings[config.expert]]
 
@@ -82,6 +89,16 @@ def digest(env: Env, *request: Any) -> str:
     if env.physics == "warp":
         versions.append(f"warp {importlib.metadata.version('warp-lang')}")
     return hashlib.sha256(json.dumps([env.name, *request, env.action_cost, *versions]).encode()).hexdigest()[:16]
+
+
+@functools.cache
+def _actor(env: Env, settings: learned.Settings, noise: float) -> learned.Actor:
+    path = platform.cache_folder() / "actors" / f"{env.name}-{digest(env, repr(settings), noise)}.npz"
+
+    def make() -> learned.Actor:
+        return learned.learn(env, settings, noise, jax.random.key(0))[0]
+
+    return pytrees.kept(path, make, lambda: learned.shapes(env, settings))
 
 
 @functools.cache

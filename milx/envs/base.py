@@ -116,6 +116,13 @@ class Env(World[TaskT]):
         """
         return self.step(task, state, action)
 
+    def misjudge(self, key: jax.Array, state: State) -> State:
+        """Moves things to where an expert that learns supposes them (`milx.trajopt.learned`).
+
+        With the same key they are off by as much in every state. The same state unless overridden.
+        """
+        return state
+
     def control(self, task: TaskT, state: State, tactic: jax.Array) -> jax.Array:
         """Returns the action [A] of a controller that knows the task, by one of the `tactics`. It may replace iLQR.
 

@@ -3,8 +3,9 @@
 The noise drives the arm off the plan and the recorded action is the feedback's answer, before the noise: a
 demonstration so shows how to recover, and its labels are clean (DART, Laskey et al. 2017). Where iLQR does not plan
 (no iterations) the feedback is the environment's controller, with a tactic that a rehearsal without noise chooses. An
-expert by sampling (`demonstrations.py`) does the same with its own plans and its own way to follow them, and one with a
-receding horizon (`receding.py`) plans again where the noise has driven it.
+expert by sampling (`demonstrations.py`) does the same with its own plans and its own way to follow them, one with a
+receding horizon (`receding.py`) plans again where the noise has driven it, and one that has learned (`learned.py`) acts
+in every state.
 """
 
 import functools
@@ -18,7 +19,7 @@ import numpy as np
 from milx.core import parallel
 from milx.core.batching import map_in_chunks
 from milx.envs.base import Env, State, Task
-from milx.trajopt import demonstrations, receding
+from milx.trajopt import demonstrations, learned, receding
 from milx.trajopt.episode import judge, problem_of
 from milx.trajopt.ilqr import Options, Plan, solve
 from milx.trajopt.planner import Plans, Settings
@@ -43,6 +44,18 @@ class Sampling(NamedTuple):
 
     settings: Settings
     plans: Plans
+
+
+class Learned(NamedTuple):
+    """An expert that has learned.
+
+    Attributes:
+        settings: with which it learned.
+        actor: what it learned.
+    """
+
+    settings: learned.Settings
+    actor: learned.Actor
 
 
 Feedback = Callable[[State, jax.Array], jax.Array]
@@ -88,11 +101,11 @@ def perform(
     task: Task,
     state: State,
     key: jax.Array,
-    options: Options | Sampling | receding.Settings,
+    options: Options | Sampling | Learned | receding.Settings,
     noise: float,
     tactic: np.ndarray | None = None,
 ) -> tuple[State, jax.Array]:
-    """Demonstrates a batch, by plans of whole episodes, with a receding horizon, or by the environment's controller.
+    """Demonstrates a batch by the expert that `options` describe.
 
     Not to be called inside `jax.jit`.
 
@@ -101,7 +114,7 @@ def perform(
         task: [N] what is to be done.
         state: [N] the scenes.
         key: [N] draw the noise.
-        options: of iLQR, with no iterations of which the controller acts, or of an expert by sampling.
+        options: of iLQR, with no iterations of which the controller acts, or of another expert.
         noise: standard deviation of the noise, in units of the action.
         tactic: [N], the tactics of the controller; None for those that `choose_tactics` finds.
 
@@ -115,6 +128,8 @@ def perform(
         return receding.demonstrate(env, options, noise, task, state, key)
     if isinstance(options, Sampling):
         return demonstrations.demonstrate(env, options.settings, options.plans, noise, task, state, key)
+    if isinstance(options, Learned):
+        return _perform_learned(env, options.settings, options.actor, noise, task, state, key)
     if options.iterations:
         return _perform_planned(env, options, noise, task, state, key)
     if tactic is None:
@@ -152,6 +167,18 @@ def _perform_planned(env: Env, options: Options, noise: float, *batch: Any) -> t
         return demonstrate(env, task, state, follow(plan(env, task, state, options)), key, noise)
 
     return parallel.shard_tasks(jax.vmap(one, in_axes=(None, 0, 0, 0)), shared=1)(noise, *batch)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _perform_learned(
+    env: Env, settings: learned.Settings, actor: learned.Actor, noise: float, *batch: Any
+) -> tuple[State, jax.Array]:
+    def one(actor: learned.Actor, noise: float, task: Task, state: State, key: jax.Array) -> tuple[State, jax.Array]:
+        return demonstrate(
+            env, task, state, lambda state, _: learned.act(env, settings, actor, task, state), key, noise
+        )
+
+    return parallel.shard_tasks(jax.vmap(one, in_axes=(None, None, 0, 0, 0)), shared=2)(actor, noise, *batch)
 
 
 @functools.partial(jax.jit, static_argnums=0)

@@ -11,7 +11,7 @@ from milx.config.assemble import make_config
 from milx.config.schema import DataConfig
 from milx.data import experts
 from milx.data.simulated import collect
-from milx.trajopt import receding
+from milx.trajopt import learned, receding
 from milx.trajopt.ilqr import Options
 from milx.trajopt.planner import Plans, Settings
 
@@ -26,7 +26,7 @@ def env():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"expert": "mppi"}, "data.expert: got 'mppi', expected one of ilqr, sampling, receding"),
+        ({"expert": "mppi"}, "data.expert: got 'mppi', expected one of ilqr, sampling, receding, ppo"),
         (
             {"expert": "sampling", "plan_iterations": 0},
             "data.plan_iterations: got 0, expected at least 1 with sampling",
@@ -35,6 +35,7 @@ def env():
             {"expert": "receding", "plan_iterations": 0},
             "data.plan_iterations: got 0, expected at least 1 with receding",
         ),
+        ({"expert": "ppo", "plan_iterations": 0}, "data.plan_iterations: got 0, expected at least 1 with ppo"),
     ],
 )
 def test_what_no_expert_understands_is_refused(env, changes, message):
@@ -64,6 +65,10 @@ def test_all_that_decides_on_demonstrations_by_sampling_describes_them(env, monk
     monkeypatch.setattr(env, "ahead", 9)
     described.append(experts.description(env, config))
     monkeypatch.setattr(experts, "RECEDING", receding.Settings(knots=3))
+    described.append(experts.description(env, config))
+    config = dataclasses.replace(config, expert="ppo")
+    described.append(experts.description(env, config))
+    monkeypatch.setattr(experts, "LEARNED", learned.Settings(width=8))
     described.append(experts.description(env, config))
     assert all(one != other for i, one in enumerate(described) for other in described[:i])
 
@@ -112,6 +117,33 @@ def test_plans_are_found_once_and_kept(env, tmp_path, monkeypatch, capsys):
     plans(dataclasses.replace(FEW, knots=6), 3)
     assert "only 3 of the 8 plans with which demonstrations of place begin succeed" in capsys.readouterr().err
     experts._plans.cache_clear()
+
+
+def test_an_expert_learns_once_and_is_kept(env, tmp_path, monkeypatch):
+    """Other noise and other iterations have files of their own."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(experts, "LEARNED", learned.Settings(width=4))
+    rng, asked = np.random.default_rng(0), []
+
+    def learn(env, settings, noise, key):
+        asked.append((settings.iterations, noise, key))
+        drawn = jax.tree.map(lambda x: rng.random(x.shape, x.dtype), learned.shapes(env, settings))
+        return drawn, np.zeros(1)
+
+    monkeypatch.setattr(learned, "learn", learn)
+
+    def expert(iterations, noise=0.1):
+        experts._actor.cache_clear()
+        return experts.expert_of(env, DataConfig(expert="ppo", plan_iterations=iterations, noise=noise))
+
+    first, again = expert(3), expert(3)
+    jax.tree.map(np.testing.assert_array_equal, first.actor, again.actor)
+    assert first.settings == learned.Settings(iterations=3, width=4)
+    expert(4)
+    expert(3, noise=0.2)
+    assert asked == [(3, 0.1, jax.random.key(0)), (4, 0.1, jax.random.key(0)), (3, 0.2, jax.random.key(0))]
+    assert len(list((tmp_path / "milx" / "actors").glob("place-*.npz"))) == 3
+    experts._actor.cache_clear()
 
 
 @pytest.mark.slow

@@ -45,6 +45,12 @@ class Cart:
     def terminal_residual(self, task, state):
         return 3 * jnp.concatenate([state.qpos - task, state.qvel])
 
+    def robot_state(self, state):
+        return jnp.concatenate([state.qpos, state.qvel])
+
+    def misjudge(self, key, state):
+        return state
+
     def success(self, task, states):
         return jnp.abs(states.qpos[-1] - task)[0] < 0.1
 

@@ -44,6 +44,8 @@ OBJECT_COST, TIP_COST, HEIGHT_COST, FINAL_COST = 1.0, 0.5, 2.0, 10.0
 """Weights of the residuals (1/m)."""
 PUSH_HEIGHT = 0.01
 """Height of the tip (m) at which the hand is to push."""
+MISJUDGED = 0.02
+"""Standard deviation of the error in where an expert that learns supposes the objects (m)."""
 _OBJECTS = ("object_0", "object_1")
 _PRONGS = ("prong_left", "prong_middle", "prong_right")
 _CANDIDATES = 64
@@ -230,6 +232,11 @@ class Push(Env[PushTask]):
         timestep = jnp.asarray(self.substeps * self.mj_model.opt.timestep / _FEWER_STEPS, float)
         cheaper = model.opt.replace(iterations=2, ls_iterations=4, timestep=timestep)
         return self._advance(model.replace(opt=cheaper), state, action, _FEWER_STEPS)
+
+    def misjudge(self, key: jax.Array, state: State) -> State:
+        """Moves both objects by errors of a normal distribution in x and y."""
+        error = jnp.pad(MISJUDGED * jax.random.normal(key, (2, 2)), ((0, 0), (0, 1)))
+        return dataclasses.replace(state, qpos=state.qpos.at[NUM_JOINTS:].add(error.ravel()))
 
     def guess(self, task: PushTask, state: State) -> jax.Array:
         """Returns [T, 7], what `controller.torque` does from here."""

@@ -1,0 +1,283 @@
+"""Learns an expert that acts in every state: a network that minimizes an environment's cost by policy optimization.
+
+Episodes begin in scenes of training tasks. In each time step the policy draws controls, which the environment's
+steering turns into an action a_t; noise is added to it, as in demonstrations, and `Env.approximate_step` follows. The
+rewards are minus the costs of the planners,
+
+    r_t = -|running_residual(x_t, a_t, t)|^2 / 2,    of which the last has -|terminal_residual(x_T)|^2 / 2 besides,
+
+and `ppo.py` maximizes their sum. The policy sees what the robot knows of itself, the positions of everything, and the
+residual of the running cost without an action, which tells what is to be done. It sees no velocity but the robot's,
+which a single image does not show, and sees things where they are not (`Env.misjudge`): so it learns to act with a
+margin, and those who imitate it from images err, too. When it demonstrates, it sees them where they are. The critic
+sees both, all velocities and the time. Everything is whitened by the mean and the standard deviation over all episodes
+so far.
+"""
+
+import dataclasses
+import functools
+from typing import NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import optax
+
+from milx.core import parallel
+from milx.envs.base import Env, State, Task
+from milx.envs.steering import Steering
+from milx.trajopt import ppo
+from milx.types import Params
+
+OPTIONS = ppo.Options()
+_FLOOR = 1e-3
+"""Least standard deviation by which what is seen is divided."""
+_FARTHEST = 5.0
+"""Whitened values are clipped to this."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """Settings of an expert that learns.
+
+    Attributes:
+        iterations: how often episodes are run and the policy is improved.
+        episodes: N, in each iteration.
+        width: units of each of three hidden layers.
+        deviation: standard deviation of the controls at first, in halves of their range.
+        least: their least standard deviation.
+        options: of the optimization.
+
+    Raises:
+        ValueError: for a number that is out of range.
+    """
+
+    iterations: int = 400
+    episodes: int = 2048
+    width: int = 256
+    deviation: float = 0.5
+    least: float = 0.08
+    options: ppo.Options = OPTIONS
+
+    def __post_init__(self) -> None:
+        for field in ("iterations", "episodes", "width"):
+            if (value := getattr(self, field)) < 1:
+                raise ValueError(f"{field}: got {value}, expected at least 1")
+        if not 0 < self.least <= self.deviation:
+            raise ValueError(f"least: got {self.least}, expected more than 0 and at most deviation = {self.deviation}")
+
+
+class Moments(NamedTuple):
+    """Means over all episodes so far.
+
+    Attributes:
+        iterations: how many there were.
+        mean: [Z], of what is seen.
+        square: [Z], of its square.
+    """
+
+    iterations: jax.Array
+    mean: jax.Array
+    square: jax.Array
+
+    def add(self, seen: jax.Array) -> "Moments":
+        """Takes the episodes of another iteration into account, [N, T, Z]."""
+        weight = 1 / (self.iterations + 1)
+        mean = self.mean + weight * (seen.mean(axis=(0, 1)) - self.mean)
+        square = self.square + weight * (jnp.square(seen).mean(axis=(0, 1)) - self.square)
+        return Moments(self.iterations + 1, mean, square)
+
+    def whiten(self, seen: jax.Array) -> jax.Array:
+        """Whitens the first entries of z [..., Z], as many as there are."""
+        mean, square = self.mean[: seen.shape[-1]], self.square[: seen.shape[-1]]
+        deviation = jnp.sqrt(jnp.maximum(square - jnp.square(mean), 0.0))
+        return jnp.clip((seen - mean) / jnp.maximum(deviation, _FLOOR), -_FARTHEST, _FARTHEST)
+
+
+class Actor(NamedTuple):
+    """A policy that has learned.
+
+    Attributes:
+        moments: of what is seen.
+        params: of the policy's network.
+    """
+
+    moments: Moments
+    params: Params
+
+
+class Learner(NamedTuple):
+    """A policy that learns.
+
+    Attributes:
+        moments: of what is seen.
+        unit: in which the critic estimates rewards: the standard deviation of their sums in the first episodes.
+        params: of the policy and of the critic, and the logarithm of the standard deviations.
+        optimizer: the optimizer's state.
+    """
+
+    moments: Moments
+    unit: jax.Array
+    params: Params
+    optimizer: optax.OptState
+
+
+class _Network(nn.Module):
+    outputs: int
+    width: int
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        for _ in range(3):
+            x = nn.swish(nn.Dense(self.width)(x))
+        small = nn.initializers.variance_scaling(1e-4, "fan_in", "truncated_normal")
+        return nn.Dense(self.outputs, kernel_init=small)(x)
+
+
+def see(env: Env, task: Task, state: State) -> jax.Array:
+    """Returns what the policy sees [F]: the robot's state, all positions, and the residual without an action."""
+    residual = env.running_residual(task, state, jnp.zeros(env.action_size), jnp.int32(0))
+    return jnp.concatenate([env.robot_state(state), state.qpos, state.mocap_pos.ravel(), residual])
+
+
+def act(env: Env, settings: Settings, actor: Actor, task: Task, state: State) -> jax.Array:
+    """Returns the action [A] of a policy that has learned, which is clipped afterwards."""
+    steering = env.steering
+    network = _Network(len(steering.low), settings.width)
+    chosen = network.apply(actor.params, actor.moments.whiten(see(env, task, state)))
+    return steering.action(state, _controls(steering, jnp.asarray(chosen)))
+
+
+def learn(env: Env, settings: Settings, noise: jax.Array | float, key: jax.Array) -> tuple[Actor, jax.Array]:
+    """Learns an expert. Not to be called inside `jax.jit`.
+
+    Args:
+        env: the environment.
+        settings: of the expert.
+        noise: standard deviation of the noise on the actions, in their units.
+        key: draws tasks, scenes, errors, controls, noise and minibatches.
+
+    Returns:
+        The policy, and the mean cost of the episodes of each iteration.
+
+    Raises:
+        ValueError: unless the time steps of all episodes make minibatches of equal size.
+    """
+    if (rows := settings.episodes * env.horizon) % (number := settings.options.minibatches):
+        raise ValueError(f"options.minibatches: got {number}, expected a divisor of {rows}, all time steps")
+    noise, costs = jnp.asarray(noise, float), []
+    learner = _begin(env, settings, noise, key)
+    for number in range(settings.iterations):
+        learner, cost = _improve(env, settings, noise, learner, jax.random.fold_in(key, 1 + number))
+        costs.append(jax.block_until_ready(cost))
+    return Actor(learner.moments, learner.params["policy"]), jnp.stack(costs)
+
+
+def shapes(env: Env, settings: Settings) -> Actor:
+    """Returns the shapes of the policy that `learn` returns."""
+    learner = jax.eval_shape(lambda key: _begin(env, settings, jnp.zeros(()), key), jax.random.key(0))
+    return Actor(learner.moments, learner.params["policy"])
+
+
+def _controls(steering: Steering, chosen: jax.Array) -> jax.Array:
+    """Returns controls [k] in the steering's units, of those that are chosen in halves of their range."""
+    middle, half = (steering.low + steering.high) / 2, (steering.high - steering.low) / 2
+    return middle + half * jnp.clip(chosen, -1.0, 1.0)
+
+
+def _networks(env: Env, settings: Settings) -> tuple[_Network, _Network]:
+    return _Network(len(env.steering.low), settings.width), _Network(1, settings.width)
+
+
+def _apply(env: Env, settings: Settings, params: Params, seen: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Applies policy and critic to z, whitened."""
+    policy, critic = _networks(env, settings)
+    mean = policy.apply(params["policy"], seen[..., : _num_seen(env)])
+    value = critic.apply(params["critic"], seen)
+    log_deviation = jnp.maximum(params["deviation"], jnp.log(settings.least))
+    return jnp.asarray(mean), log_deviation, jnp.asarray(value)[..., 0]
+
+
+@functools.cache
+def _num_seen(env: Env) -> int:
+    """F, the part of z that the policy sees."""
+
+    def first(key: jax.Array) -> jax.Array:
+        task = env.sample_task(key, "train")
+        return see(env, task, env.reset(key, task))
+
+    return int(jax.eval_shape(first, jax.random.key(0)).shape[0])
+
+
+def _episode(
+    env: Env, settings: Settings, noise: jax.Array, moments: Moments, params: Params, key: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Runs an episode and returns z [T, Z], u [T, k] and r [T]."""
+    task_key, scene_key, error_key, step_key = jax.random.split(key, 4)
+    task, steering = env.sample_task(task_key, "train"), env.steering
+    low, high = env.action_range
+
+    def step(state: State, inputs: tuple[jax.Array, jax.Array]) -> tuple[State, tuple]:
+        t, key = inputs
+        control_key, noise_key = jax.random.split(key)
+        supposed = see(env, task, env.misjudge(error_key, state))
+        seen = jnp.concatenate([supposed, see(env, task, state), state.qvel, t[None] / env.horizon])
+        mean, log_deviation, _ = _apply(env, settings, params, moments.whiten(seen))
+        control = mean + jnp.exp(log_deviation) * jax.random.normal(control_key, mean.shape)
+        action = jnp.clip(steering.action(state, _controls(steering, control)), low, high)
+        reward = -jnp.square(env.running_residual(task, state, action, t)).sum() / 2
+        after = env.approximate_step(task, state, action + noise * jax.random.normal(noise_key, action.shape))
+        return after, (seen, control, reward)
+
+    inputs = jnp.arange(env.horizon), jax.random.split(step_key, env.horizon)
+    last, (seen, control, reward) = jax.lax.scan(step, env.reset(scene_key, task), inputs)
+    return seen, control, reward.at[-1].add(-jnp.square(env.terminal_residual(task, last)).sum() / 2)
+
+
+def _episodes(
+    env: Env, settings: Settings, noise: jax.Array, moments: Moments, params: Params, key: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Runs the N episodes of an iteration."""
+    run = jax.vmap(functools.partial(_episode, env, settings), in_axes=(None, None, None, 0))
+    return parallel.shard_tasks(run, shared=3)(noise, moments, params, jax.random.split(key, settings.episodes))
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _begin(env: Env, settings: Settings, noise: jax.Array, key: jax.Array) -> Learner:
+    """Draws the networks, and whitens by the first episodes."""
+    policy_key, critic_key, episode_key = jax.random.split(key, 3)
+    policy, critic = _networks(env, settings)
+    part, controls = _num_seen(env), len(env.steering.low)
+    size = 2 * part + env.reset(key, env.sample_task(key, "train")).qvel.size + 1
+    params = {
+        "policy": policy.init(policy_key, jnp.zeros(part)),
+        "critic": critic.init(critic_key, jnp.zeros(size)),
+        "deviation": jnp.full(controls, jnp.log(settings.deviation)),
+    }
+    moments = Moments(jnp.zeros(()), jnp.zeros(size), jnp.zeros(size))
+    seen, _, reward = _episodes(env, settings, noise, moments, params, episode_key)
+    sums = jnp.cumsum(reward[:, ::-1], axis=1)
+    optimizer = ppo.optimizer(settings.options, settings.iterations)
+    return Learner(moments.add(seen), jnp.maximum(sums.std(), 1e-6), params, optimizer.init(params))
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _improve(
+    env: Env, settings: Settings, noise: jax.Array, learner: Learner, key: jax.Array
+) -> tuple[Learner, jax.Array]:
+    """Runs episodes, improves the policy and the critic, and returns the mean cost of the episodes, too."""
+    episode_key, order_key = jax.random.split(key)
+    moments, params, options = learner.moments, learner.params, settings.options
+    seen, control, reward = _episodes(env, settings, noise, moments, params, episode_key)
+    whitened = moments.whiten(seen)
+    apply = functools.partial(_apply, env, settings)
+    mean, log_deviation, value = apply(params, whitened)
+    gain = jax.vmap(ppo.advantages, in_axes=(0, 0, None, None))(
+        reward / learner.unit, value, options.discount, options.trace
+    )
+    chance = ppo.log_probability(control, mean, log_deviation)
+    rows = ppo.Experience(whitened, control, chance, gain, gain + value)
+    rows = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rows)
+    optimizer = ppo.optimizer(options, settings.iterations)
+    params, state = ppo.improve(apply, options, optimizer, (params, learner.optimizer), rows, order_key)
+    return Learner(moments.add(seen), learner.unit, params, state), -reward.sum(axis=1).mean()

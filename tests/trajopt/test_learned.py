@@ -1,0 +1,140 @@
+"""Experts that learn by policy optimization: on a cart, whose world is a few lines, and what push has them suppose."""
+
+import dataclasses
+import functools
+
+import cart_laws
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.optimize
+
+import milx
+from milx.envs.base import State
+from milx.trajopt import learned, ppo
+from milx.trajopt.expert import Learned, perform
+from milx.trajopt.learned import Settings
+
+NOISE = 0.05
+SETTINGS = Settings(iterations=80, episodes=64, width=32, options=ppo.Options(minibatches=4, rate=3e-3))
+
+
+@pytest.fixture(scope="module")
+def found(cart):
+    return learned.learn(cart, SETTINGS, NOISE, jax.random.key(0))
+
+
+def test_settings_out_of_range_are_refused():
+    with pytest.raises(ValueError, match="episodes: got 0, expected at least 1"):
+        Settings(episodes=0)
+    with pytest.raises(ValueError, match=r"least: got 0\.6, expected more than 0 and at most deviation = 0\.5"):
+        Settings(least=0.6)
+
+
+def test_minibatches_of_different_sizes_are_refused(cart):
+    settings = Settings(episodes=3, options=ppo.Options(minibatches=5))
+    with pytest.raises(ValueError, match=r"options\.minibatches: got 5, expected a divisor of 36, all time steps"):
+        learned.learn(cart, settings, NOISE, jax.random.key(0))
+
+
+def total(cart, task, start, actions):
+    """Adds up the planners' costs, in the approximation and without noise."""
+    cost, state = 0.0, start
+    for t, action in enumerate(actions):
+        cost += jnp.square(cart.running_residual(task, state, action, t)).sum() / 2
+        state = cart.approximate_step(task, state, action)
+    return cost + jnp.square(cart.terminal_residual(task, state)).sum() / 2
+
+
+def test_it_costs_little_more_than_the_best_actions(cart, scenes, found):
+    """SciPy finds these with all that is to come in view; the cost is convex."""
+    actor, _ = found
+    act = jax.jit(functools.partial(learned.act, cart, SETTINGS, actor))
+    value = jax.jit(jax.value_and_grad(lambda actions, task, start: total(cart, task, start, actions[:, None])))
+    costs = []
+    for i in range(20):
+        task, start = jax.tree.map(lambda x, i=i: x[i], scenes[:2])
+        state, actions = start, []
+        for _ in range(cart.horizon):
+            actions.append(jnp.clip(act(task, state), -1, 1))
+            state = cart.approximate_step(task, state, actions[-1])
+        best = scipy.optimize.minimize(
+            lambda x, task=task, start=start: [np.asarray(v, float) for v in value(jnp.asarray(x, float), task, start)],
+            np.zeros(cart.horizon),
+            jac=True,
+            bounds=[(-1, 1)] * cart.horizon,
+        )
+        nothing = total(cart, task, start, jnp.zeros((cart.horizon, 1)))
+        costs.append([float(total(cart, task, start, actions)), best.fun, float(nothing)])
+    acted, best, nothing = np.mean(costs, axis=0)
+    assert best <= acted < best + 0.1 * (nothing - best)
+
+
+def test_the_costs_are_those_of_the_episodes(found):
+    _, costs = found
+    assert costs[-10:].mean() < 0.1 * costs[0]
+
+
+def test_demonstrations_record_all_but_the_noise(cart, scenes, found):
+    expert = Learned(SETTINGS, found[0])
+
+    def demonstrate(noise, task, start, keys):
+        return perform(cart, task, start, keys, expert, noise)
+
+    cart_laws.check_that_noise_alone_is_not_recorded(demonstrate, scenes, NOISE)
+    cart_laws.check_that_noise_alone_tells_demonstrations_of_a_scene_apart(demonstrate, scenes, NOISE)
+
+
+def test_the_same_is_learned_again_and_its_shapes_are_known(cart, found):
+    again, _ = learned.learn(cart, SETTINGS, NOISE, jax.random.key(0))
+    jax.tree.map(np.testing.assert_array_equal, again, found[0])
+    expected = learned.shapes(cart, SETTINGS)
+    assert jax.tree.structure(expected) == jax.tree.structure(found[0])
+    assert [x.shape for x in jax.tree.leaves(expected)] == [x.shape for x in jax.tree.leaves(found[0])]
+
+
+def test_moments_are_those_of_all_that_was_seen():
+    seen = np.random.default_rng(0).normal(3.0, 2.0, (4, 5, 6, 3))
+    moments = learned.Moments(jnp.zeros(()), jnp.zeros(3), jnp.zeros(3))
+    for part in seen:
+        moments = moments.add(jnp.asarray(part, float))
+    mean, deviation = seen.mean(axis=(0, 1, 2)), seen.std(axis=(0, 1, 2))
+    np.testing.assert_allclose(moments.whiten(jnp.asarray(mean + 2 * deviation, float)), 2.0, rtol=1e-4)
+    np.testing.assert_allclose(moments.whiten(jnp.asarray((mean - deviation)[:2], float)), -1.0, rtol=1e-4)
+
+
+@pytest.fixture(scope="module")
+def push():
+    return milx.make("push", (8, 8))
+
+
+def test_push_is_learned_with_objects_that_are_off_by_a_constant(push):
+    rng = np.random.default_rng(0)
+    one, other = (State(*(jnp.asarray(rng.normal(size=n), float) for n in (13, 13)), jnp.zeros((0, 3))) for _ in "ab")
+    off = []
+    for key in jax.random.split(jax.random.key(0), 500):
+        supposed = push.misjudge(key, one)
+        np.testing.assert_array_equal(supposed.qvel, one.qvel)
+        off.append(supposed.qpos - one.qpos)
+        np.testing.assert_allclose(push.misjudge(key, other).qpos - other.qpos, off[-1], atol=1e-6)
+    moved = np.array([7, 8, 10, 11])
+    assert not np.delete(np.array(off), moved, axis=1).any(), "the arm and the turns"
+    error = np.array(off)[:, moved]
+    np.testing.assert_allclose(error.std(axis=0), 0.02, rtol=3 / np.sqrt(2 * 500))
+    np.testing.assert_allclose(error.mean(axis=0), 0.0, atol=3 * 0.02 / np.sqrt(500))
+    assert np.abs(np.corrcoef(error.T) - np.eye(4)).max() < 4 / np.sqrt(500)
+
+
+def test_push_tells_its_expert_the_target_but_no_velocity_of_an_object(push):
+    key = jax.random.key(1)
+    task = push.sample_task(key, "train")
+    state = push.reset(key, task)
+    seen = learned.see(push, task, state)
+    faster = State(state.qpos, state.qvel.at[7:].set(1.0), state.mocap_pos)
+    np.testing.assert_array_equal(learned.see(push, task, faster), seen)
+    other = learned.see(push, dataclasses.replace(task, target=1 - task.target), state)
+    places = push.objects(state)[:, :2]
+    expected = places[1 - task.target] - places[task.target]
+    changed = np.asarray(other - seen)
+    np.testing.assert_allclose(changed[changed != 0][:2], expected, rtol=1e-4)
