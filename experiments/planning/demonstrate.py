@@ -45,7 +45,7 @@ def measure(env: Env, config: DataConfig, scenes: int) -> Iterator[dict[str, Any
     """Plans and executes `scenes` scenes, rounded up to whole batches, and yields what is known after each batch."""
     began, batch = time.perf_counter(), config.plan_batch
     expert = experts.expert_of(env, config)
-    plans, seconds, counts = {}, {}, []
+    plans, counts = {}, []
     if isinstance(expert, Sampling):
         plans = {"plans_to_begin_with": int(expert.plans.success.sum())}
     seconds = {"before the first demonstration, with compilation": time.perf_counter() - began}

@@ -256,7 +256,8 @@ def cached(
 
     The hash covers the arguments, the kind of device, and the versions of JAX, MuJoCo, the environment and the experts.
     How many demonstrations are planned at once is left out: it changes no more than rounding, by which an expert by
-    sampling may choose another of two plans that are nearly as good.
+    sampling may choose another of two plans that are nearly as good. A network that learns on another kind of GPU may
+    differ by more, since rounding grows while it learns.
     """
     digest = experts.digest(env, seed, split, num_tasks, num_demos, *experts.description(env, config))
     path = folder / f"{env.name}-{split}-{digest}.npz"

@@ -46,8 +46,8 @@ class Env(World[TaskT]):
             `image_to_goal` must be symmetric; what tasks draw need not be, so that a thing's mirror image may have a
             shape that no task has. None where there is no such mirror.
         action_cost: weight of the action in the planner's running cost (no unit): the lower, the faster the expert.
-        version: raised when tasks, scenes, physics, costs, the steering or the controller change, so that no
-            demonstration planned before it is taken for one planned after it.
+        version: raised when tasks, scenes, physics, costs, the steering, the controller, or what an expert that learns
+            is told or supposes change, so that no demonstration made before it is taken for one made after it.
     """
 
     name: str

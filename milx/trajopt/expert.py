@@ -25,7 +25,7 @@ from milx.trajopt.ilqr import Options, Plan, solve
 from milx.trajopt.planner import Plans, Settings
 
 VERSION = 3
-"""Of all that plans and demonstrates: raised when it does so differently with the same settings, so that no
+"""Of all that plans, learns and demonstrates: raised when it does so differently with the same settings, so that no
 demonstration planned before it is taken for one planned after it."""
 
 

@@ -6,12 +6,13 @@ rewards are minus the costs of the planners,
 
     r_t = -|running_residual(x_t, a_t, t)|^2 / 2,    of which the last has -|terminal_residual(x_T)|^2 / 2 besides,
 
-and `ppo.py` maximizes their sum. The policy sees what the robot knows of itself, the positions of everything, and the
-residual of the running cost without an action, which tells what is to be done. It sees no velocity but the robot's,
-which a single image does not show, and sees things where they are not (`Env.misjudge`): so it learns to act with a
-margin, and those who imitate it from images err, too. When it demonstrates, it sees them where they are. The critic
-sees both, all velocities and the time. Everything is whitened by the mean and the standard deviation over all episodes
-so far.
+and `ppo.py` maximizes their discounted sum; a_t is clipped to its range, and is without the noise. The policy sees what
+the robot knows of itself, the positions of everything, and the residual of the running cost at time 0 without an
+action, which tells what is to be done. It is told the velocities of other things only where that residual has them,
+since a single image does not show these. It supposes things where they are not (`Env.misjudge`), as those who imitate
+it from images do, so it learns to act with a margin; when it demonstrates, it sees them where they are. The critic sees
+both, all velocities and the time. Everything is whitened by the mean and the standard deviation over all episodes so
+far. An episode that diverges is replaced by another one.
 """
 
 import dataclasses
@@ -42,10 +43,10 @@ class Settings:
 
     Attributes:
         iterations: how often episodes are run and the policy is improved.
-        episodes: N, in each iteration.
+        episodes: N, in each iteration, rounded up to a multiple of the number of devices.
         width: units of each of three hidden layers.
         deviation: standard deviation of the controls at first, in halves of their range.
-        least: their least standard deviation.
+        least: their least standard deviation; one that has come down to it stays there.
         options: of the optimization.
 
     Raises:
@@ -71,7 +72,7 @@ class Moments(NamedTuple):
     """Means over all episodes so far.
 
     Attributes:
-        iterations: how many there were.
+        iterations: how often episodes were run.
         mean: [Z], of what is seen.
         square: [Z], of its square.
     """
@@ -111,7 +112,8 @@ class Learner(NamedTuple):
 
     Attributes:
         moments: of what is seen.
-        unit: in which the critic estimates rewards: the standard deviation of their sums in the first episodes.
+        unit: in which the critic estimates rewards: the standard deviation of their sums from each time step of the
+            first episodes on.
         params: of the policy and of the critic, and the logarithm of the standard deviations.
         optimizer: the optimizer's state.
     """
@@ -143,8 +145,8 @@ def see(env: Env, task: Task, state: State) -> jax.Array:
 def act(env: Env, settings: Settings, actor: Actor, task: Task, state: State) -> jax.Array:
     """Returns the action [A] of a policy that has learned, which is clipped afterwards."""
     steering = env.steering
-    network = _Network(len(steering.low), settings.width)
-    chosen = network.apply(actor.params, actor.moments.whiten(see(env, task, state)))
+    policy, _ = _networks(env, settings)
+    chosen = policy.apply(actor.params, actor.moments.whiten(see(env, task, state)))
     return steering.action(state, _controls(steering, jnp.asarray(chosen)))
 
 
@@ -158,18 +160,23 @@ def learn(env: Env, settings: Settings, noise: jax.Array | float, key: jax.Array
         key: draws tasks, scenes, errors, controls, noise and minibatches.
 
     Returns:
-        The policy, and the mean cost of the episodes of each iteration.
+        The policy, and the mean cost [iterations] of the episodes that it learned from, in which its controls spread.
 
     Raises:
         ValueError: unless the time steps of all episodes make minibatches of equal size.
+        FloatingPointError: if all episodes of an iteration diverge.
     """
-    if (rows := settings.episodes * env.horizon) % (number := settings.options.minibatches):
-        raise ValueError(f"options.minibatches: got {number}, expected a divisor of {rows}, all time steps")
+    rows = parallel.round_up(settings.episodes) * env.horizon
+    if rows % (minibatches := settings.options.minibatches):
+        raise ValueError(f"options.minibatches: got {minibatches}, expected a divisor of {rows}, all time steps")
+    first_key, key = jax.random.split(key)
     noise, costs = jnp.asarray(noise, float), []
-    learner = _begin(env, settings, noise, key)
+    learner = _begin(env, settings, noise, first_key)
     for number in range(settings.iterations):
-        learner, cost = _improve(env, settings, noise, learner, jax.random.fold_in(key, 1 + number))
-        costs.append(jax.block_until_ready(cost))
+        learner, cost = _improve(env, settings, noise, learner, jax.random.fold_in(key, number))
+        costs.append(cost)
+        if not jnp.isfinite(cost):
+            raise FloatingPointError(f"{env.name}: got a cost of {cost}, expected a finite one: all episodes diverge")
     return Actor(learner.moments, learner.params["policy"]), jnp.stack(costs)
 
 
@@ -237,9 +244,13 @@ def _episode(
 def _episodes(
     env: Env, settings: Settings, noise: jax.Array, moments: Moments, params: Params, key: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Runs the N episodes of an iteration."""
+    """Runs the N episodes of an iteration; the first that is finite takes the place of those that are not."""
     run = jax.vmap(functools.partial(_episode, env, settings), in_axes=(None, None, None, 0))
-    return parallel.shard_tasks(run, shared=3)(noise, moments, params, jax.random.split(key, settings.episodes))
+    keys = jax.random.split(key, parallel.round_up(settings.episodes))
+    found = parallel.shard_tasks(run, shared=3)(noise, moments, params, keys)
+    finite = jnp.stack([jnp.isfinite(x).reshape(len(x), -1).all(axis=1) for x in found]).all(axis=0)
+    rows = jnp.where(finite, jnp.arange(len(finite)), jnp.argmax(finite))
+    return jax.tree.map(lambda x: x[rows], found)
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
@@ -252,7 +263,7 @@ def _begin(env: Env, settings: Settings, noise: jax.Array, key: jax.Array) -> Le
     params = {
         "policy": policy.init(policy_key, jnp.zeros(part)),
         "critic": critic.init(critic_key, jnp.zeros(size)),
-        "deviation": jnp.full(controls, jnp.log(settings.deviation)),
+        "deviation": jnp.full(controls, jnp.log(settings.deviation), float),
     }
     moments = Moments(jnp.zeros(()), jnp.zeros(size), jnp.zeros(size))
     seen, _, reward = _episodes(env, settings, noise, moments, params, episode_key)

@@ -49,7 +49,7 @@ class Cart:
         return jnp.concatenate([state.qpos, state.qvel])
 
     def misjudge(self, key, state):
-        return state
+        return dataclasses.replace(state, qpos=state.qpos + 0.02 * jax.random.normal(key, (1,)))
 
     def success(self, task, states):
         return jnp.abs(states.qpos[-1] - task)[0] < 0.1

@@ -71,9 +71,56 @@ def test_it_costs_little_more_than_the_best_actions(cart, scenes, found):
     assert best <= acted < best + 0.1 * (nothing - best)
 
 
-def test_the_costs_are_those_of_the_episodes(found):
+def test_episodes_cost_less_and_less(found):
     _, costs = found
     assert costs[-10:].mean() < 0.1 * costs[0]
+
+
+def test_an_episode_is_what_its_controls_and_the_noise_make_of_it(cart, found):
+    """What is supposed is off by a constant, the rewards are minus the costs, and the critic sees the truth."""
+    moments = learned.Moments(jnp.ones(()), jnp.zeros(12), 1 + jnp.zeros(12))
+    params = {"policy": found[0].params, "deviation": jnp.log(jnp.full(1, 0.3))}
+    params["critic"] = learned._Network(1, SETTINGS.width).init(jax.random.key(0), jnp.zeros(12))
+    run = jax.jit(functools.partial(learned._episode, cart, SETTINGS, NOISE, moments, params))
+    drawn, errors = [], []
+    for key in jax.random.split(jax.random.key(3), 60):
+        seen, control, reward = map(np.asarray, run(key))
+        supposed, truth, velocity, time = seen[:, :5], seen[:, 5:10], seen[:, 10], seen[:, 11]
+        errors.append(supposed[0, 0] - truth[0, 0])
+        np.testing.assert_allclose(
+            supposed - truth, np.tile(errors[-1] * np.array([1, 0, 1, 1, 0]), (12, 1)), atol=1e-5
+        )
+        np.testing.assert_allclose(truth[:, 1], velocity)
+        np.testing.assert_allclose(time, np.arange(12) / 12, rtol=1e-6)
+        np.testing.assert_allclose(np.diff(truth[:, 0]), 0.25 * velocity[1:], atol=1e-5)
+        action = np.clip(control[:, 0], -1, 1)
+        expected = -(truth[:, 3] ** 2 + (0.1 * action) ** 2) / 2
+        np.testing.assert_allclose(reward[:-1], expected[:-1], rtol=1e-4, atol=1e-6)
+        assert reward[-1] < expected[-1], "the terminal cost"
+        driven = np.diff(velocity) / 0.25 * 0.8
+        drawn.append(np.where(np.abs(driven) < 0.99, driven - action[:-1], np.nan))
+    count = np.isfinite(drawn).sum()
+    assert count > 200
+    np.testing.assert_allclose(np.sqrt(np.nanmean(np.square(drawn))), NOISE, rtol=3 / np.sqrt(2 * count))
+    np.testing.assert_allclose(np.std(errors), 0.02, rtol=3 / np.sqrt(2 * 60))
+
+
+def test_episodes_that_diverge_do_not_count(cart, monkeypatch):
+    """A third of the carts begin nowhere, and in the end all of them do."""
+    reset, odd = cart.reset, type(cart)()
+
+    def nowhere(share, key, task):
+        state = reset(key, task)
+        return dataclasses.replace(state, qpos=jnp.where(jax.random.uniform(key) < share, jnp.nan, state.qpos))
+
+    monkeypatch.setattr(odd, "reset", functools.partial(nowhere, 1 / 3), raising=False)
+    settings = dataclasses.replace(SETTINGS, iterations=30)
+    actor, costs = learned.learn(odd, settings, NOISE, jax.random.key(0))
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(actor))
+    assert costs[-5:].mean() < 0.2 * costs[0]
+    monkeypatch.setattr(odd, "reset", functools.partial(nowhere, 1.0))
+    with pytest.raises(FloatingPointError, match="cart: got a cost of nan, expected a finite one"):
+        learned.learn(odd, dataclasses.replace(settings, width=16), NOISE, jax.random.key(0))
 
 
 def test_demonstrations_record_all_but_the_noise(cart, scenes, found):
