@@ -236,6 +236,7 @@ _SAMPLING = {
     "data.plan_batch": 512,
     "evaluation.baseline_trials": 1,
 }
+_PPO = _SAMPLING | {"data.expert": "ppo", "data.plan_iterations": 400, "data.plan_batch": 2048}
 _LADDER = _ladder()
 _SAMPLED = _LADDER["push-fast"].changes | _SAMPLING
 _MORE_TASKS = (
@@ -259,6 +260,11 @@ _EXPERTS = {
         "push: the second row, but with chunks of four actions, of which the mean is executed",
         "push",
         _MORE_TASKS | {"method.chunk": 4, "method.execute": 0},
+    ),
+    "push-ppo": Row(
+        "push: `fast`, by policy optimization, more of the beginning",
+        "push",
+        _LADDER["push-fast"].changes | _PPO | {"train.frame_exponent": 2.0},
     ),
 }
 
