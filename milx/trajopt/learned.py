@@ -19,7 +19,6 @@ import dataclasses
 import functools
 from typing import NamedTuple
 
-import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import optax
@@ -27,6 +26,7 @@ import optax
 from milx.core import parallel
 from milx.envs.base import Env, State, Task
 from milx.envs.steering import Steering
+from milx.networks.mlp import MLP
 from milx.trajopt import ppo
 from milx.types import Params
 
@@ -124,18 +124,6 @@ class Learner(NamedTuple):
     optimizer: optax.OptState
 
 
-class _Network(nn.Module):
-    outputs: int
-    width: int
-
-    @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
-        for _ in range(3):
-            x = nn.swish(nn.Dense(self.width)(x))
-        small = nn.initializers.variance_scaling(1e-4, "fan_in", "truncated_normal")
-        return nn.Dense(self.outputs, kernel_init=small)(x)
-
-
 def see(env: Env, task: Task, state: State) -> jax.Array:
     """Returns what the policy sees [F]: the robot's state, all positions, and the residual without an action."""
     residual = env.running_residual(task, state, jnp.zeros(env.action_size), jnp.int32(0))
@@ -192,8 +180,8 @@ def _controls(steering: Steering, chosen: jax.Array) -> jax.Array:
     return middle + half * jnp.clip(chosen, -1.0, 1.0)
 
 
-def _networks(env: Env, settings: Settings) -> tuple[_Network, _Network]:
-    return _Network(len(env.steering.low), settings.width), _Network(1, settings.width)
+def _networks(env: Env, settings: Settings) -> tuple[MLP, MLP]:
+    return MLP(len(env.steering.low), settings.width), MLP(1, settings.width)
 
 
 def _apply(env: Env, settings: Settings, params: Params, seen: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:

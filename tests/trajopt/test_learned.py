@@ -12,6 +12,7 @@ import scipy.optimize
 
 import milx
 from milx.envs.base import State
+from milx.networks.mlp import MLP
 from milx.trajopt import learned, ppo
 from milx.trajopt.expert import Learned, perform
 from milx.trajopt.learned import Settings
@@ -80,7 +81,7 @@ def test_an_episode_is_what_its_controls_and_the_noise_make_of_it(cart, found):
     """What is supposed is off by a constant, the rewards are minus the costs, and the critic sees the truth."""
     moments = learned.Moments(jnp.ones(()), jnp.zeros(12), 1 + jnp.zeros(12))
     params = {"policy": found[0].params, "deviation": jnp.log(jnp.full(1, 0.3))}
-    params["critic"] = learned._Network(1, SETTINGS.width).init(jax.random.key(0), jnp.zeros(12))
+    params["critic"] = MLP(1, SETTINGS.width).init(jax.random.key(0), jnp.zeros(12))
     run = jax.jit(functools.partial(learned._episode, cart, SETTINGS, NOISE, moments, params))
     drawn, errors = [], []
     for key in jax.random.split(jax.random.key(3), 60):
