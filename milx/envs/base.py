@@ -123,6 +123,13 @@ class Env(World[TaskT]):
         """
         return state
 
+    def visible(self, task: TaskT, state: State) -> jax.Array:
+        """Returns what else an expert that learns is told, [L]: what an image shows beside positions, such as shapes.
+
+        Nothing unless overridden.
+        """
+        return jnp.zeros(0)
+
     def control(self, task: TaskT, state: State, tactic: jax.Array) -> jax.Array:
         """Returns the action [A] of a controller that knows the task, by one of the `tactics`. It may replace iLQR.
 

@@ -7,12 +7,12 @@ rewards are minus the costs of the planners,
     r_t = -|running_residual(x_t, a_t, t)|^2 / 2,    of which the last has -|terminal_residual(x_T)|^2 / 2 besides,
 
 and `ppo.py` maximizes their discounted sum; a_t is clipped to its range, and is without the noise. The policy sees what
-the robot knows of itself, the positions of everything, and the residual of the running cost at time 0 without an
-action, which tells what is to be done. It is told the velocities of other things only where that residual has them,
-since a single image does not show these. It supposes things where they are not (`Env.misjudge`), as those who imitate
-it from images do, so it learns to act with a margin; when it demonstrates, it sees them where they are. The critic sees
-both, all velocities and the time. Everything is whitened by the mean and the standard deviation over all episodes so
-far. An episode that diverges is replaced by another one.
+the robot knows of itself, the positions of everything, the residual of the running cost at time 0 without an action,
+which tells what is to be done, and what `Env.visible` adds. It is told the velocities of other things only where that
+residual has them, since a single image does not show these. It supposes things where they are not (`Env.misjudge`), as
+those who imitate it from images do, so it learns to act with a margin; when it demonstrates, it sees them where they
+are. The critic sees both, all velocities and the time. Everything is whitened by the mean and the standard deviation
+over all episodes so far. An episode that diverges is replaced by another one.
 """
 
 import dataclasses
@@ -53,7 +53,7 @@ class Settings:
         ValueError: for a number that is out of range.
     """
 
-    iterations: int = 400
+    iterations: int = 600
     episodes: int = 2048
     width: int = 256
     deviation: float = 0.5
@@ -125,9 +125,10 @@ class Learner(NamedTuple):
 
 
 def see(env: Env, task: Task, state: State) -> jax.Array:
-    """Returns what the policy sees [F]: the robot's state, all positions, and the residual without an action."""
+    """Returns what the policy sees [F]: the robot's state, positions, the residual without an action, and the rest."""
     residual = env.running_residual(task, state, jnp.zeros(env.action_size), jnp.int32(0))
-    return jnp.concatenate([env.robot_state(state), state.qpos, state.mocap_pos.ravel(), residual])
+    known = env.robot_state(state), state.qpos, state.mocap_pos.ravel(), residual, env.visible(task, state)
+    return jnp.concatenate(known)
 
 
 def act(env: Env, settings: Settings, actor: Actor, task: Task, state: State) -> jax.Array:

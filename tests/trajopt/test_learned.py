@@ -12,6 +12,8 @@ import scipy.optimize
 
 import milx
 from milx.envs.base import State
+from milx.envs.shapes import SHAPES
+from milx.envs.shapes.primitives import distance_to_outline, to_geoms
 from milx.networks.mlp import MLP
 from milx.trajopt import learned, ppo
 from milx.trajopt.expert import Learned, perform
@@ -186,3 +188,18 @@ def test_push_tells_its_expert_the_target_but_no_velocity_of_an_object(push):
     expected = places[1 - task.target] - places[task.target]
     changed = np.asarray(other - seen)
     np.testing.assert_allclose(changed[changed != 0][:2], expected, rtol=1e-4)
+
+
+def test_push_tells_its_expert_how_far_the_target_reaches(push):
+    grid = np.stack(np.meshgrid(*[np.linspace(-3, 3, 601)] * 2), axis=-1)
+    angle = np.arange(8) * np.pi / 4
+    directions = np.stack([np.cos(angle), np.sin(angle)])
+    for key in jax.random.split(jax.random.key(2), 6):
+        task = push.sample_task(key, "train")
+        state = push.reset(key, task)
+        shape = to_geoms(list(SHAPES.values())[int(task.shape[task.target])])
+        covered = grid[distance_to_outline(grid, shape.ends, shape.radius) <= 0]
+        turn = float(push.objects(state)[task.target, 2])
+        world = covered @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+        expected = float(task.size[task.target]) * (world @ directions).max(axis=0)
+        np.testing.assert_allclose(push.visible(task, state), expected, atol=1e-3)  # a hundredth of a unit of 5 cm

@@ -46,6 +46,8 @@ PUSH_HEIGHT = 0.01
 """Height of the tip (m) at which the hand is to push."""
 MISJUDGED = 0.02
 """Standard deviation of the error in where an expert that learns supposes the objects (m)."""
+_DIRECTIONS = np.stack([np.cos(np.arange(8) * np.pi / 4), np.sin(np.arange(8) * np.pi / 4)], axis=-1)
+"""In which an expert that learns is told the target's outline."""
 _OBJECTS = ("object_0", "object_1")
 _PRONGS = ("prong_left", "prong_middle", "prong_right")
 _CANDIDATES = 64
@@ -238,6 +240,17 @@ class Push(Env[PushTask]):
         error = jnp.pad(MISJUDGED * jax.random.normal(key, (2, 2)), ((0, 0), (0, 1)))
         return dataclasses.replace(state, qpos=state.qpos.at[NUM_JOINTS:].add(error.ravel()))
 
+    def visible(self, task: PushTask, state: State) -> jax.Array:
+        """Returns [8], how far the target reaches from its center in eight directions (m)."""
+        return self.outline(task, state, jnp.asarray(_DIRECTIONS, float))
+
+    def outline(self, task: PushTask, state: State, directions: jax.Array) -> jax.Array:
+        """Returns [D], how far the target reaches from its center in directions [D, 2] of the world (m)."""
+        turn, shape = self.objects(state)[task.target, 2], jax.tree.map(lambda x: x[task.target], self._shapes_of(task))
+        cos, sin = jnp.cos(turn), jnp.sin(turn)
+        along = shape.ends @ (jnp.array([[cos, sin], [-sin, cos]]) @ directions.T)  # as the object sees them
+        return task.size[task.target] * (along.max(axis=1) + shape.radius[:, None]).max(axis=0)
+
     def guess(self, task: PushTask, state: State) -> jax.Array:
         """Returns [T, 7], what `controller.torque` does from here."""
         tactic = jnp.asarray(self.tactics[0])
@@ -251,14 +264,10 @@ class Push(Env[PushTask]):
     def control(self, task: PushTask, state: State, tactic: jax.Array) -> jax.Array:
         """Returns [7], what `controller.torque` does in one state, `tactic` (m) to the side of the object's center."""
         target = task.target
-        x, y, turn = self.objects(state)[target]
+        place = self.objects(state)[target, :2]
         pose, jacobian = self.hand(state.qpos), jax.jacfwd(self.hand)(state.qpos[:NUM_JOINTS])
-        place = jnp.stack([x, y])
         ahead = -place / jnp.maximum(jnp.linalg.norm(place), 0.02)
-        cos, sin = jnp.cos(turn), jnp.sin(turn)
-        backwards = -jnp.array([[cos, sin], [-sin, cos]]) @ ahead  # as the object sees it
-        shape = jax.tree.map(lambda x: x[target], self._shapes_of(task))
-        outline = task.size[target] * (jnp.max(shape.ends @ backwards, axis=-1) + shape.radius).max()
+        outline = self.outline(task, state, -ahead[None])[0]
         joints, velocity = self.model.dof_damping[:NUM_JOINTS], state.qvel[:NUM_JOINTS]
         touching, friction = outline + self._prong, task.damping[target]
         torque = controller.torque(pose, jacobian, velocity, joints, place, ahead, touching, tactic, friction)
