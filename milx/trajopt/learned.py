@@ -1,8 +1,9 @@
 """Learns an expert that acts in every state: a network that minimizes an environment's cost by policy optimization.
 
-Episodes begin in scenes of training tasks. In each time step the policy draws controls, which the environment's
-steering turns into an action a_t; noise is added to it, as in demonstrations, and `Env.approximate_step` follows. The
-rewards are minus the costs of the planners,
+Episodes begin in scenes of training tasks, half of them after the policy has gone astray, since it supposed things far
+from where they are: so it learns to recover, for example from beyond a thing that it was to push. In each time step the
+policy draws controls, which the environment's steering turns into an action a_t; noise is added to it, as in
+demonstrations, and `Env.approximate_step` follows. The rewards are minus the costs of the planners,
 
     r_t = -|running_residual(x_t, a_t, t)|^2 / 2,    of which the last has -|terminal_residual(x_T)|^2 / 2 besides,
 
@@ -33,6 +34,8 @@ from milx.types import Params
 OPTIONS = ppo.Options()
 _FLOOR = 1e-3
 """Least standard deviation by which what is seen is divided."""
+_FAR = 5.0
+"""How many times as far off things are supposed by a policy that goes astray."""
 _FARTHEST = 5.0
 """Whitened values are clipped to this."""
 
@@ -44,6 +47,8 @@ class Settings:
     Attributes:
         iterations: how often episodes are run and the policy is improved.
         episodes: N, in each iteration, rounded up to a multiple of the number of devices.
+        astray: how long the policy goes astray, drawn uniformly up to this part of the horizon. It does not learn from
+            that time.
         width: units of each of three hidden layers.
         deviation: standard deviation of the controls at first, in halves of their range.
         least: their least standard deviation; one that has come down to it stays there.
@@ -53,8 +58,9 @@ class Settings:
         ValueError: for a number that is out of range.
     """
 
-    iterations: int = 600
+    iterations: int = 700
     episodes: int = 2048
+    astray: float = 0.4
     width: int = 256
     deviation: float = 0.5
     least: float = 0.08
@@ -64,6 +70,8 @@ class Settings:
         for field in ("iterations", "episodes", "width"):
             if (value := getattr(self, field)) < 1:
                 raise ValueError(f"{field}: got {value}, expected at least 1")
+        if self.astray < 0:
+            raise ValueError(f"astray: got {self.astray}, expected at least 0")
         if not 0 < self.least <= self.deviation:
             raise ValueError(f"least: got {self.least}, expected more than 0 and at most deviation = {self.deviation}")
 
@@ -209,24 +217,37 @@ def _episode(
     env: Env, settings: Settings, noise: jax.Array, moments: Moments, params: Params, key: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Runs an episode and returns z [T, Z], u [T, k] and r [T]."""
-    task_key, scene_key, error_key, step_key = jax.random.split(key, 4)
+    task_key, scene_key, error_key, step_key, astray_key = jax.random.split(key, 5)
     task, steering = env.sample_task(task_key, "train"), env.steering
     low, high = env.action_range
+
+    def choose(state: State, supposed: State, t: jax.Array, key: jax.Array) -> tuple[jax.Array, ...]:
+        seen = jnp.concatenate([see(env, task, supposed), see(env, task, state), state.qvel, t[None] / env.horizon])
+        mean, log_deviation, _ = _apply(env, settings, params, moments.whiten(seen))
+        control = mean + jnp.exp(log_deviation) * jax.random.normal(key, mean.shape)
+        return seen, control, jnp.clip(steering.action(state, _controls(steering, control)), low, high)
 
     def step(state: State, inputs: tuple[jax.Array, jax.Array]) -> tuple[State, tuple]:
         t, key = inputs
         control_key, noise_key = jax.random.split(key)
-        supposed = see(env, task, env.misjudge(error_key, state))
-        seen = jnp.concatenate([supposed, see(env, task, state), state.qvel, t[None] / env.horizon])
-        mean, log_deviation, _ = _apply(env, settings, params, moments.whiten(seen))
-        control = mean + jnp.exp(log_deviation) * jax.random.normal(control_key, mean.shape)
-        action = jnp.clip(steering.action(state, _controls(steering, control)), low, high)
+        seen, control, action = choose(state, env.misjudge(error_key, state), t, control_key)
         reward = -jnp.square(env.running_residual(task, state, action, t)).sum() / 2
         after = env.approximate_step(task, state, action + noise * jax.random.normal(noise_key, action.shape))
         return after, (seen, control, reward)
 
+    def stray(state: State, inputs: tuple[jax.Array, jax.Array]) -> tuple[State, None]:
+        t, key = inputs
+        off = env.misjudge(far_key, state)
+        far = jax.tree.map(lambda true, supposed: true + _FAR * (supposed - true), state, off)
+        after = env.approximate_step(task, state, choose(state, far, t, key)[-1])
+        return jax.tree.map(lambda new, old: jnp.where(t < until, new, old), after, state), None
+
+    most, (until_key, far_key, stray_key) = round(settings.astray * env.horizon), jax.random.split(astray_key, 3)
+    until = jax.random.randint(until_key, (), -most, most + 1)
+    keys = jax.random.split(stray_key, most)
+    start = jax.lax.scan(stray, env.reset(scene_key, task), (jnp.arange(most), keys))[0]
     inputs = jnp.arange(env.horizon), jax.random.split(step_key, env.horizon)
-    last, (seen, control, reward) = jax.lax.scan(step, env.reset(scene_key, task), inputs)
+    last, (seen, control, reward) = jax.lax.scan(step, start, inputs)
     return seen, control, reward.at[-1].add(-jnp.square(env.terminal_residual(task, last)).sum() / 2)
 
 
