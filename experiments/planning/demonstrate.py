@@ -38,7 +38,7 @@ from milx.trajopt.expert import Sampling
 
 FIRST_SEED = 1000
 """Of the scenes; push.py and the trials by which settings were chosen have smaller ones."""
-ITERATIONS = {"sampling": 8, "receding": 1, "ppo": 700}
+ITERATIONS = {"sampling": 8, "receding": 1, "ppo": 600}
 
 
 def measure(env: Env, config: DataConfig, scenes: int) -> Iterator[dict[str, Any]]:

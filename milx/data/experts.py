@@ -9,9 +9,10 @@ from typing import Any
 
 import jax
 import mujoco
+from rich.console import Console
 
 from milx.config.schema import DataConfig
-from milx.core import platform, pytrees
+from milx.core import platform, progress, pytrees
 from milx.core.messages import warn
 from milx.envs.base import Env
 from milx.trajopt import expert, learned, receding
@@ -37,7 +38,7 @@ def expert_of(env: Env, config: DataConfig) -> Options | Sampling | Learned | re
     user's cache.
 
     It says so if fewer than half of these plans succeed. The first expert by policy optimization learns, under the same
-    noise, and is kept there, too.
+    noise, and is kept there, too. It says so if it costs no less than at the beginning.
 
     Raises:
         ValueError: for another name than those of EXPERTS, or no iterations of any but iLQR.
@@ -96,7 +97,14 @@ def _actor(env: Env, settings: learned.Settings, noise: float) -> learned.Actor:
     path = platform.cache_folder() / "actors" / f"{env.name}-{digest(env, repr(settings), noise)}.npz"
 
     def make() -> learned.Actor:
-        return learned.learn(env, settings, noise, jax.random.key(0))[0]
+        with progress.phase(Console(), f"learning to demonstrate {env.name}", settings.iterations):
+            actor, costs = learned.learn(env, settings, noise, jax.random.key(0))
+        if not costs[-1] < costs[0]:
+            warn(
+                f"the expert of {env.name} has learned nothing: an episode costs {costs[-1]:.3g} at the end, and cost "
+                f"{costs[0]:.3g} at the beginning; its costs, its steering or data.noise may be why"
+            )
+        return actor
 
     return pytrees.kept(path, make, lambda: learned.shapes(env, settings))
 

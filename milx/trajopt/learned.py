@@ -24,7 +24,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from milx.core import parallel
+from milx.core import parallel, progress
 from milx.envs.base import Env, State, Task
 from milx.envs.steering import Steering
 from milx.networks.mlp import MLP
@@ -58,8 +58,8 @@ class Settings:
         ValueError: for a number that is out of range.
     """
 
-    iterations: int = 700
-    episodes: int = 2048
+    iterations: int = 600
+    episodes: int = 4096
     astray: float = 0.4
     width: int = 256
     deviation: float = 0.5
@@ -148,7 +148,7 @@ def act(env: Env, settings: Settings, actor: Actor, task: Task, state: State) ->
 
 
 def learn(env: Env, settings: Settings, noise: jax.Array | float, key: jax.Array) -> tuple[Actor, jax.Array]:
-    """Learns an expert. Not to be called inside `jax.jit`.
+    """Learns an expert, and tells how far it is (`milx.core.progress`). Not to be called inside `jax.jit`.
 
     Args:
         env: the environment.
@@ -172,6 +172,7 @@ def learn(env: Env, settings: Settings, noise: jax.Array | float, key: jax.Array
     for number in range(settings.iterations):
         learner, cost = _improve(env, settings, noise, learner, jax.random.fold_in(key, number))
         costs.append(cost)
+        progress.advance(1, f"cost {cost:.3g}")
         if not jnp.isfinite(cost):
             raise FloatingPointError(f"{env.name}: got a cost of {cost}, expected a finite one: all episodes diverge")
     return Actor(learner.moments, learner.params["policy"]), jnp.stack(costs)

@@ -44,7 +44,7 @@ class Options:
     """
 
     epochs: int = 4
-    minibatches: int = 16
+    minibatches: int = 32
     discount: float = 0.99
     trace: float = 0.95
     clip: float = 0.2

@@ -119,16 +119,16 @@ def test_plans_are_found_once_and_kept(env, tmp_path, monkeypatch, capsys):
     experts._plans.cache_clear()
 
 
-def test_an_expert_learns_once_and_is_kept(env, tmp_path, monkeypatch):
+def test_an_expert_learns_once_and_is_kept(env, tmp_path, monkeypatch, capsys):
     """Other noise and other iterations have files of their own."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(experts, "LEARNED", learned.Settings(width=4))
-    rng, asked = np.random.default_rng(0), []
+    rng, asked, costs = np.random.default_rng(0), [], [2.0, 1.0]
 
     def learn(env, settings, noise, key):
         asked.append((settings.iterations, noise, key))
         drawn = jax.tree.map(lambda x: rng.random(x.shape, x.dtype), learned.shapes(env, settings))
-        return drawn, np.zeros(1)
+        return drawn, np.array(costs)
 
     monkeypatch.setattr(learned, "learn", learn)
 
@@ -143,6 +143,11 @@ def test_an_expert_learns_once_and_is_kept(env, tmp_path, monkeypatch):
     expert(3, noise=0.2)
     assert asked == [(3, 0.1, jax.random.key(0)), (4, 0.1, jax.random.key(0)), (3, 0.2, jax.random.key(0))]
     assert len(list((tmp_path / "milx" / "actors").glob("place-*.npz"))) == 3
+    assert not capsys.readouterr().err
+    costs[1] = 2.0
+    expert(5)
+    expected = "the expert of place has learned nothing: an episode costs 2 at the end, and cost 2 at the beginning"
+    assert expected in capsys.readouterr().err
     experts._actor.cache_clear()
 
 

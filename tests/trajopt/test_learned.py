@@ -31,6 +31,8 @@ def found(cart):
 def test_settings_out_of_range_are_refused():
     with pytest.raises(ValueError, match="episodes: got 0, expected at least 1"):
         Settings(episodes=0)
+    with pytest.raises(ValueError, match=r"astray: got -0\.1, expected at least 0"):
+        Settings(astray=-0.1)
     with pytest.raises(ValueError, match=r"least: got 0\.6, expected more than 0 and at most deviation = 0\.5"):
         Settings(least=0.6)
 
@@ -106,6 +108,27 @@ def test_an_episode_is_what_its_controls_and_the_noise_make_of_it(cart, found):
     assert count > 200
     np.testing.assert_allclose(np.sqrt(np.nanmean(np.square(drawn))), NOISE, rtol=3 / np.sqrt(2 * count))
     np.testing.assert_allclose(np.std(errors), 0.02, rtol=3 / np.sqrt(2 * 60))
+
+
+def test_half_of_the_episodes_begin_after_the_policy_has_gone_astray(cart, found):
+    """Those that have not gone astray begin in the same scenes as without; a policy that errs pushes the cart away."""
+    moments = learned.Moments(jnp.ones(()), jnp.zeros(12), 1 + jnp.zeros(12))
+    params = {"policy": found[0].params, "deviation": jnp.log(jnp.full(1, 0.1))}
+    params["critic"] = MLP(1, SETTINGS.width).init(jax.random.key(0), jnp.zeros(12))
+    keys = jax.random.split(jax.random.key(4), 400)
+
+    def begin(settings):
+        run = functools.partial(learned._episode, cart, settings, NOISE, moments, params)
+        seen, _, _ = jax.jit(jax.vmap(run))(keys)
+        return np.asarray(seen[:, 0, 5:7])  # where the cart is, and its velocity
+
+    scenes, led = begin(dataclasses.replace(SETTINGS, astray=0.0)), begin(SETTINGS)
+    assert not scenes[:, 1].any()
+    moved = (led != scenes).any(axis=1)
+    most = round(SETTINGS.astray * cart.horizon)
+    share = most / (2 * most + 1)
+    assert abs(moved.mean() - share) < 3 * np.sqrt(share * (1 - share) / 400)
+    assert np.abs(led[moved, 1]).mean() > 0.1
 
 
 def test_episodes_that_diverge_do_not_count(cart, monkeypatch):
