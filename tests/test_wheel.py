@@ -21,6 +21,9 @@ for name in ("reach", "push", "place"):
     spec = policy.spec
     seen = milx.Observation(np.zeros((*spec.image_shape, 3), np.uint8), np.zeros(spec.state_size, np.float32))
     assert np.isfinite(policy.act(policy.params, seen)).all()
+from milx.config.schema import DataConfig
+from milx.data import experts
+experts.expert_of(milx.make("push", (8, 8)), DataConfig(expert="pretrained"))
 """
 
 
@@ -46,7 +49,7 @@ def installed(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_the_policies_that_ship_act(installed):
+def test_the_policies_and_the_expert_that_ship_are_there(installed):
     run, site = installed
     done = run("-c", USE)
     assert done.returncode == 0, done.stderr[-2000:]

@@ -6,6 +6,7 @@
     python experiments/planning/demonstrate.py --envs=grasp --expert=receding --scenes=512
     python experiments/planning/demonstrate.py --envs=grasp --expert=receding --scenes=512 --physics=warp
     python experiments/planning/demonstrate.py --envs=push --expert=ppo --batch=2048
+    python experiments/planning/demonstrate.py --envs=push --expert=pretrained --scenes=512    # on two cores
 
 Plans as a run with this `data.expert` does (`milx.data.experts`). With "sampling" the plans with which all scenes begin
 are searched for first, in 256 other scenes, and with "ppo" a network learns first. Nothing comes from a cache. No
@@ -38,7 +39,13 @@ from milx.trajopt.expert import Sampling
 
 FIRST_SEED = 1000
 """Of the scenes; push.py and the trials by which settings were chosen have smaller ones."""
-ITERATIONS = {"sampling": 8, "receding": 1, "ppo": 600}
+ITERATIONS = {"sampling": 8, "receding": 1, "ppo": 600, "pretrained": 1}
+SETTINGS = {
+    "sampling": experts.SETTINGS,
+    "receding": experts.RECEDING,
+    "ppo": experts.LEARNED,
+    "pretrained": experts.LEARNED,
+}
 
 
 def measure(env: Env, config: DataConfig, scenes: int) -> Iterator[dict[str, Any]]:
@@ -80,7 +87,7 @@ def main(_: list[str]) -> None:
         config = dataclasses.replace(config, **changes)
         env, settings = envs.make(name, (16, 16)), {"first_seed": FIRST_SEED, "physics": _PHYSICS.value}
         env = env.by_warp() if _PHYSICS.value == "warp" else env
-        of_expert: Any = {"sampling": experts.SETTINGS, "receding": experts.RECEDING, "ppo": experts.LEARNED}[expert]
+        of_expert: Any = SETTINGS[expert]
         settings |= dataclasses.asdict(of_expert) | ({"ahead": env.ahead} if expert == "receding" else {})
         for found in measure(env, config, _SCENES.value):
             said = {"env": name, "data": dataclasses.asdict(config), "settings": settings}

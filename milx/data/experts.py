@@ -5,6 +5,7 @@ import functools
 import hashlib
 import importlib.metadata
 import json
+import pathlib
 from typing import Any
 
 import jax
@@ -17,20 +18,22 @@ from milx.core.messages import warn
 from milx.envs.base import Env
 from milx.trajopt import expert, learned, receding
 from milx.trajopt.demonstrations import find_plans, no_plans, share_plans
-from milx.trajopt.expert import Learned, Sampling
+from milx.trajopt.expert import Expert, Learned, Sampling
 from milx.trajopt.ilqr import Options
 from milx.trajopt.planner import Plans, Settings
 
-EXPERTS = ("ilqr", "sampling", "receding", "ppo")
+EXPERTS = ("ilqr", "sampling", "receding", "ppo", "pretrained")
 SETTINGS = Settings()
 """Of experts that plan whole episodes by sampling."""
 RECEDING = receding.Settings()
 """Of experts with a receding horizon."""
 LEARNED = learned.Settings()
 """Of experts that learn by policy optimization."""
+PRETRAINED = pathlib.Path(__file__).parent / "actors"
+"""Folder of the experts by policy optimization that ship, one file for an environment."""
 
 
-def expert_of(env: Env, config: DataConfig) -> Options | Sampling | Learned | receding.Settings:
+def expert_of(env: Env, config: DataConfig) -> Expert:
     """Returns the expert that a run's settings ask for.
 
     The first expert that plans whole episodes of an environment by sampling searches for plans with which others begin,
@@ -41,9 +44,10 @@ def expert_of(env: Env, config: DataConfig) -> Options | Sampling | Learned | re
     noise, and is kept there, too. It says so if it costs no less than at the beginning.
 
     Raises:
-        ValueError: for another name than those of EXPERTS, or no iterations of any but iLQR.
+        ValueError: for another name than those of EXPERTS, no iterations of one that needs them, or an environment
+            for which no expert ships.
     """
-    _check(config)
+    _check(env, config)
     if config.expert == "ilqr":
         return Options(iterations=config.plan_iterations)
     if config.expert == "receding":
@@ -52,6 +56,8 @@ def expert_of(env: Env, config: DataConfig) -> Options | Sampling | Learned | re
     if config.expert == "ppo":
         settings = dataclasses.replace(LEARNED, iterations=config.plan_iterations)
         return Learned(settings, _actor(env, settings, config.noise))
+    if config.expert == "pretrained":
+        return Learned(LEARNED, _pretrained(env))
     search = dataclasses.replace(SETTINGS.search, iterations=config.plan_iterations)
     return Sampling(
         dataclasses.replace(SETTINGS, search=search), _plans(env, SETTINGS, config.noise, config.plan_batch)
@@ -64,23 +70,30 @@ def description(env: Env, config: DataConfig) -> list:
     Raises:
         ValueError: as `expert_of`.
     """
-    _check(config)
+    _check(env, config)
     settings: dict[str, list] = {
         "ilqr": [],
         "sampling": ["sampling", repr(SETTINGS)],
         "receding": ["receding", repr(RECEDING), env.ahead],
         "ppo": ["ppo", repr(LEARNED)],
     }
+    if config.expert == "pretrained":
+        return [config.noise, "pretrained", pytrees.fingerprint(_pretrained(env))]
     return [config.noise, config.plan_iterations, *settings[config.expert]]
 
 
-def _check(config: DataConfig) -> None:
+def _check(env: Env, config: DataConfig) -> None:
     """Refuses what `expert_of` documents."""
     if config.expert not in EXPERTS:
         raise ValueError(f"data.expert: got {config.expert!r}, expected one of {', '.join(EXPERTS)}")
-    if config.expert != "ilqr" and config.plan_iterations < 1:
+    if config.expert not in ("ilqr", "pretrained") and config.plan_iterations < 1:
         raise ValueError(
             f"data.plan_iterations: got {config.plan_iterations}, expected at least 1 with {config.expert}"
+        )
+    if config.expert == "pretrained" and not (PRETRAINED / f"{env.name}.npz").exists():
+        there = ", ".join(sorted(path.stem for path in PRETRAINED.glob("*.npz")))
+        raise ValueError(
+            f"data.expert: got 'pretrained', expected another one with {env.name}: experts ship for {there} only"
         )
 
 
@@ -90,6 +103,11 @@ def digest(env: Env, *request: Any) -> str:
     if env.physics == "warp":
         versions.append(f"warp {importlib.metadata.version('warp-lang')}")
     return hashlib.sha256(json.dumps([env.name, *request, env.action_cost, *versions]).encode()).hexdigest()[:16]
+
+
+@functools.cache
+def _pretrained(env: Env) -> learned.Actor:
+    return pytrees.read(PRETRAINED / f"{env.name}.npz", learned.shapes(env, LEARNED))
 
 
 @functools.cache

@@ -79,7 +79,7 @@ def collect(
     """
     options, numbers = experts.expert_of(env, config), itertools.count()
     tasks, each, state, keys = _draw(env, jax.random.fold_in(key, SPLITS.index(split)), split, num_tasks, num_demos)
-    tactic = None if config.plan_iterations else choose_tactics(env, each, state, config.plan_batch)
+    tactic = choose_tactics(env, options, each, state, config.plan_batch)
 
     def plan_part(task: Task, state: State, key: jax.Array, tactic: Any) -> tuple[State, jax.Array]:
         make = functools.partial(perform, env, task, state, key, options, config.noise, tactic)

@@ -236,7 +236,7 @@ def evaluate_baselines(env: Env, demos: DemoSet, config: EvalConfig, expert: Dat
     total = demos.num_tasks * num_trials  # said, as arrays without entries do not tell
     tasks, scenes, keys, as_it_is = _expert_inputs(env, demos.task, key, config.trials, num_trials)
     options = expert_of(env, expert)
-    tactic = None if expert.plan_iterations else choose_tactics(env, tasks, scenes, expert.plan_batch)
+    tactic = choose_tactics(env, options, tasks, scenes, expert.plan_batch)
 
     def plan(task: Task, state: State, key: jax.Array, tactic: Any) -> tuple[State, jax.Array]:
         return perform(env, task, state, key, options, 0.0, tactic)

@@ -58,6 +58,8 @@ class Learned(NamedTuple):
     actor: learned.Actor
 
 
+Expert = Options | Sampling | Learned | receding.Settings
+"""Who demonstrates: iLQR, with no iterations of which the environment's controller does, or another expert."""
 Feedback = Callable[[State, jax.Array], jax.Array]
 """Maps a state and the time step (int32 scalar) to an action [A]."""
 
@@ -101,7 +103,7 @@ def perform(
     task: Task,
     state: State,
     key: jax.Array,
-    options: Options | Sampling | Learned | receding.Settings,
+    options: Expert,
     noise: float,
     tactic: np.ndarray | None = None,
 ) -> tuple[State, jax.Array]:
@@ -133,16 +135,18 @@ def perform(
     if options.iterations:
         return _perform_planned(env, options, noise, task, state, key)
     if tactic is None:
-        tactic = choose_tactics(env, task, state, len(key))
+        tactic = choose_tactics(env, options, task, state, len(key))
     return _perform_controlled(env, noise, task, state, tactic, key)
 
 
-def choose_tactics(env: Env, task: Task, state: State, batch: int) -> np.ndarray:
+def choose_tactics(env: Env, options: Expert, task: Task, state: State, batch: int) -> np.ndarray | None:
     """Finds, for each of N scenes, the first tactic [N] with which the controller succeeds without noise.
 
     Where no tactic succeeds it is the first of all. Only scenes in which the tactics before have failed rehearse the
-    next one. `batch` scenes rehearse at once.
+    next one. `batch` scenes rehearse at once. Other experts than the controller have none: it is None for them.
     """
+    if not isinstance(options, Options) or options.iterations:
+        return None
     chosen = np.full(len(state.qpos), env.tactics[0])
     unsolved = np.arange(len(chosen)) if len(env.tactics) > 1 else np.array([], int)
 

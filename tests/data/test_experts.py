@@ -151,6 +151,22 @@ def test_an_expert_learns_once_and_is_kept(env, tmp_path, monkeypatch, capsys):
     experts._actor.cache_clear()
 
 
+def test_no_expert_ships_for_place(env):
+    expected = "data.expert: got 'pretrained', expected another one with place: experts ship for push only"
+    for ask in (experts.expert_of, experts.description):
+        with pytest.raises(ValueError, match=expected):
+            ask(env, DataConfig(expert="pretrained"))
+
+
+@pytest.mark.slow
+def test_the_expert_that_ships_pushes():
+    """Uses the preset's noise, and shapes that the expert did not learn with, of which it fails in one of a hundred."""
+    settings = {"expert": "pretrained", "plan_batch": 24}
+    config = dataclasses.replace(make_config("push", preset="fast").data, **settings)
+    demos = collect(milx.make("push", (8, 8)), jax.random.key(3), "validation", 12, 2, config)
+    assert int(demos.success.sum()) >= 22  # of 24; fewer in one of 500 sets if 99% succeed
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("expert", "iterations"), [("sampling", 4), ("receding", 1)])
 def test_place_is_demonstrated_by_sampling(env, monkeypatch, expert, iterations):

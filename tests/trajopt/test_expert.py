@@ -131,6 +131,8 @@ def test_the_controller_gets_the_first_tactic_that_succeeds_in_rehearsal():
     x, y, _ = np.moveaxis(scenes.mocap_pos[:, 0], -1, 0)
     expected = np.where(x < 0.1, np.where(y > 0, 0.3, -0.3), 0.0)
     assert set(np.unique(expected)) == {-0.3, 0.0, 0.3}
-    np.testing.assert_array_equal(expert.choose_tactics(env, tasks, scenes, 7), expected)
-    _, action = expert.perform(env, tasks, scenes, keys, Options(iterations=0), NOISE)
+    controller = Options(iterations=0)
+    np.testing.assert_array_equal(expert.choose_tactics(env, controller, tasks, scenes, 7), expected)
+    assert expert.choose_tactics(env, Options(iterations=1), tasks, scenes, 7) is None
+    _, action = expert.perform(env, tasks, scenes, keys, controller, NOISE)
     np.testing.assert_allclose(action[..., 0], np.broadcast_to(expected[:, None], action.shape[:2]), rtol=1e-6)
