@@ -236,7 +236,7 @@ _SAMPLING = {
     "data.plan_batch": 512,
     "evaluation.baseline_trials": 1,
 }
-_PPO = _SAMPLING | {"data.expert": "ppo", "data.plan_iterations": 600, "data.plan_batch": 2048}
+_PPO = _SAMPLING | {"data.expert": "ppo", "data.plan_iterations": 500, "data.plan_batch": 2048}
 _LADDER = _ladder()
 _SAMPLED = _LADDER["push-fast"].changes | _SAMPLING
 _MORE_TASKS = (

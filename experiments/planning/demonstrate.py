@@ -39,7 +39,7 @@ from milx.trajopt.expert import Sampling
 
 FIRST_SEED = 1000
 """Of the scenes; push.py and the trials by which settings were chosen have smaller ones."""
-ITERATIONS = {"sampling": 8, "receding": 1, "ppo": 600, "pretrained": 1}
+ITERATIONS = {"sampling": 8, "receding": 1, "ppo": 500, "pretrained": 1}
 SETTINGS = {
     "sampling": experts.SETTINGS,
     "receding": experts.RECEDING,

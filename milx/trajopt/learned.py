@@ -58,7 +58,7 @@ class Settings:
         ValueError: for a number that is out of range.
     """
 
-    iterations: int = 600
+    iterations: int = 500
     episodes: int = 4096
     astray: float = 0.4
     width: int = 256

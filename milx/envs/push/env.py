@@ -44,7 +44,7 @@ OBJECT_COST, TIP_COST, HEIGHT_COST, FINAL_COST = 1.0, 0.5, 2.0, 10.0
 """Weights of the residuals (1/m)."""
 PUSH_HEIGHT = 0.01
 """Height of the tip (m) at which the hand is to push."""
-MISJUDGED = 0.02
+MISJUDGED = 0.015
 """Standard deviation of the error in where an expert that learns supposes the objects (m)."""
 _DIRECTIONS = np.stack([np.cos(np.arange(8) * np.pi / 4), np.sin(np.arange(8) * np.pi / 4)], axis=-1)
 """In which an expert that learns is told the target's outline."""
