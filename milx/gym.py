@@ -25,7 +25,6 @@ from milx.config.schema import DataConfig
 from milx.data.experts import expert_of
 from milx.data.simulated import render_demo
 from milx.envs.base import State
-from milx.trajopt.expert import perform
 from milx.types import SPLITS, Demo
 
 
@@ -108,12 +107,12 @@ class GymEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
             A demonstration [T, ...] of NumPy arrays.
 
         Raises:
-            ValueError: as `expert_of`, and without iterations where the environment has no controller.
+            ValueError: as `expert_of`.
         """
         config = config or make_config(self.env.name, preset="fast").data
         scene = self._reset(self._key(), self._task)
         task, state, key = jax.tree.map(lambda x: x[None], (self._task, scene, self._key()))
-        planned = perform(self.env, task, state, key, expert_of(self.env, config), config.noise)
+        planned = expert_of(self.env, config).perform(self.env, task, state, key, config.noise)
         states, action = jax.tree.map(lambda x: x[0], planned)
         return jax.tree.map(np.asarray, jax.jit(render_demo, static_argnums=0)(self.env, self._task, states, action))
 

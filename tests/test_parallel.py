@@ -46,7 +46,7 @@ def measure(num_devices, everything):
     from milx.evaluation import closed_loop
     from milx.methods.whitening import Whitening
     from milx.training.update import Trainer, make_optimizer
-    from milx.trajopt.expert import perform
+    from milx.trajopt.expert import Planned
     from milx.trajopt.ilqr import Options
 
     parallel.mesh = lambda: Mesh(jax.devices()[:num_devices], (parallel.AXIS,))
@@ -81,7 +81,7 @@ def measure(num_devices, everything):
         found["trials"] = np.asarray(trials.states.qpos).tolist()
         start = jax.tree.map(lambda x: x[:4, 0, 0], demos.states)
         task = jax.tree.map(lambda x: x[:4], demos.task)
-        _, action = perform(env, task, start, jax.random.split(key, 4), Options(iterations=2), 0.01)
+        _, action = Planned(Options(iterations=2)).perform(env, task, start, jax.random.split(key, 4), 0.01)
         found["action"] = np.asarray(action).tolist()
     return found
 

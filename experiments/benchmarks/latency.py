@@ -26,7 +26,7 @@ from milx.deploy.policy import Policy
 from milx.envs.base import Env
 from milx.evaluation import closed_loop
 from milx.training.update import Trainer, make_optimizer
-from milx.trajopt.expert import perform
+from milx.trajopt.expert import Planned
 from milx.trajopt.ilqr import Options
 from milx.types import Observation
 
@@ -69,7 +69,8 @@ def measure_planning(env: Env, report: common.Report) -> None:
     keys = jax.random.split(jax.random.key(0), count)
     task = jax.vmap(env.sample_task, in_axes=(0, None))(keys, "train")
     state = jax.vmap(env.reset)(keys, task)
-    milliseconds = common.median_ms(lambda: perform(env, task, state, keys, Options(iterations=16), 0.01), repeats=3)
+    expert = Planned(Options(iterations=16))
+    milliseconds = common.median_ms(lambda: expert.perform(env, task, state, keys, 0.01), repeats=3)
     report.add("demonstrations planned", 1e3 * count / milliseconds, "1/s", note=f"{count} at once")
 
 

@@ -12,19 +12,26 @@ import time
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from absl import app, flags
 
 import milx
-from milx import envs
 from milx.config.schema import DataConfig, EvalConfig
 from milx.core import files
+from milx.data import experts
+from milx.data.push_controller import TACTICS, Controlled, control
 from milx.data.simulated import collect
+from milx.envs.base import State
+from milx.envs.push.env import Push, PushTask
 from milx.evaluation import provenance
 from milx.evaluation.closed_loop import evaluate_baselines
 from milx.evaluation.intervals import wilson_interval
 
 EXPERTS = {"controller": 0, "one-tactic": 0, "ilqr": 5}
 """By name, the most iterations of iLQR."""
+experts.EXPERTS["one-tactic"] = experts.Kind(
+    lambda *_: Controlled(control, TACTICS[:1]), lambda *_: ["one-tactic"], plans=False
+)
 NOISE = (0.0, 0.1)
 """Standard deviation on the actions; the presets' is the last."""
 _EXPERTS = flags.DEFINE_multi_enum("experts", list(EXPERTS), list(EXPERTS), "Which (repeat the flag).")
@@ -32,18 +39,29 @@ _OUT = flags.DEFINE_string("out", "experiments/results/experts", "Folder of the 
 _SCENES = flags.DEFINE_integer("scenes", 512, "Scenes of each split, each of another task.", lower_bound=1)
 
 
+class FromController(Push):
+    """Push where iLQR begins with what the controller does without a choice of tactics."""
+
+    def guess(self, task: PushTask, state: State) -> jax.Array:
+        """Returns [T, 7], what the controller does from here."""
+
+        def step(state: State, _: None) -> tuple[State, jax.Array]:
+            action = control(self, task, state, jnp.asarray(TACTICS[0]))
+            return self.step(task, state, action), action
+
+        return jax.lax.scan(step, state, length=self.horizon)[1]
+
+
 def compare(name: str, scenes: int) -> list[dict[str, Any]]:
     """Measures the success of an expert for each split and noise, with baselines beside the controller's.
 
     The seconds of the first entry include compilation.
     """
-    env, key, found = envs.make("push", (16, 16)), jax.random.key(0), []
-    if name == "one-tactic":
-        env.tactics = env.tactics[:1]
+    env, key, found = FromController((16, 16)), jax.random.key(0), []
     for split in ("train", "validation"):
         for noise in NOISE:
             began = time.perf_counter()
-            config = DataConfig(noise=noise, plan_iterations=EXPERTS[name], plan_batch=256)
+            config = DataConfig(noise=noise, expert=name, plan_iterations=EXPERTS[name], plan_batch=256)
             demos = collect(env, key, split, scenes, 1, config)
             count = int(demos.success.sum())
             row: dict[str, Any] = {

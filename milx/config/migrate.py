@@ -2,12 +2,12 @@
 
 Version 1 had no version number. All methods shared one class of network settings and one group "mil", so a
 configuration also held fields that its method did not use. In version 2, `lstm_attention` still had the settings of
-convolutions and of a goal head.
+convolutions and of a goal head. In version 3, no iterations of iLQR meant the controller of push.
 """
 
 from typing import Any
 
-VERSION = 3
+VERSION = 4
 """Of the layout. It must rise with a new field in which None means something else than what milx did before it, since
 unknown fields that are None are ignored."""
 
@@ -35,12 +35,14 @@ def migrate(values: dict[str, Any]) -> dict[str, Any]:
         ValueError: for an unknown version.
     """
     version = values.get("config_version", 1)
-    if version not in (1, 2, VERSION):
+    if version not in (1, 2, 3, VERSION):
         raise ValueError(f"config_version: got {version!r}, expected at most {VERSION}: made by a later milx")
     values = {name: value for name, value in values.items() if name != "config_version"}
     if version == 1:
         values = _from_version_1(values)
-    return values if version == VERSION else _from_version_2(values)
+    if version <= 2:
+        values = _from_version_2(values)
+    return values if version == VERSION else _from_version_3(values)
 
 
 def _from_version_1(values: dict[str, Any]) -> dict[str, Any]:
@@ -64,3 +66,10 @@ def _from_version_2(values: dict[str, Any]) -> dict[str, Any]:
     if values.get("method_name") != "lstm_attention" or not isinstance(network, dict):
         return values
     return values | {"network": {name: value for name, value in network.items() if name not in _OF_VISION}}
+
+
+def _from_version_3(values: dict[str, Any]) -> dict[str, Any]:
+    data = values.get("data")
+    if not isinstance(data, dict) or data.get("plan_iterations") != 0 or data.get("expert", "ilqr") != "ilqr":
+        return values
+    return values | {"data": data | {"expert": "controller"}}

@@ -57,14 +57,14 @@ class DataConfig:
         demos_per_task: demonstrations of each training task, in different scenes.
         noise: standard deviation of the Gaussian noise on the expert's actions, in units of the action.
         spare_demos: additional demonstrations of each validation and test task, so that failed ones can be replaced.
-        expert: how demonstrations are planned: "ilqr"; "sampling", which plans whole episodes
-            (`milx.trajopt.planner`); "receding", which plans the next time steps (`milx.trajopt.receding`); "ppo", a
-            network that first learns to minimize the same cost (`milx.trajopt.learned`); or "pretrained", such a
-            network that ships, for push. The last four need neither derivatives nor a controller.
-        plan_iterations: iterations of trajectory optimization for a demonstration: with "ilqr" their maximum number, or
-            0 to use the environment's controller instead; with "sampling" their number, 8 in the results that are
-            reported; with "receding" their number in each of many plans, for which 1 is enough; with "ppo" the number
-            of batches of episodes that the network learns from before it demonstrates; with "pretrained" nothing.
+        expert: who demonstrates: "ilqr" plans; "sampling" plans whole episodes (`milx.trajopt.planner`), and "receding"
+            the next time steps (`milx.trajopt.receding`), without derivatives; "ppo" is a network that first learns to
+            minimize the same cost (`milx.trajopt.learned`), and "pretrained" such a network that ships, for push;
+            "controller" knows how to push (`milx.data.push_controller`). `milx.data.experts.EXPERTS` has them by name.
+        plan_iterations: iterations of trajectory optimization for a demonstration: with "ilqr" their maximum number;
+            with "sampling" their number, 8 in the results that are reported; with "receding" their number in each of
+            many plans, for which 1 is enough; with "ppo" the number of batches of episodes that the network learns from
+            before it demonstrates; with the others nothing.
         plan_batch: demonstrations planned at once; with "sampling" each of them rolls out 64 plans at once, with
             "receding" 96.
     """

@@ -6,7 +6,8 @@ import hashlib
 import importlib.metadata
 import json
 import pathlib
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import mujoco
@@ -15,14 +16,14 @@ from rich.console import Console
 from milx.config.schema import DataConfig
 from milx.core import platform, progress, pytrees
 from milx.core.messages import warn
+from milx.data.push_controller import CONTROLLER, Controlled
 from milx.envs.base import Env
 from milx.trajopt import expert, learned, receding
 from milx.trajopt.demonstrations import find_plans, no_plans, share_plans
-from milx.trajopt.expert import Expert, Learned, Sampling
+from milx.trajopt.expert import Expert, Learned, Planned, Receding, Sampling
 from milx.trajopt.ilqr import Options
 from milx.trajopt.planner import Plans, Settings
 
-EXPERTS = ("ilqr", "sampling", "receding", "ppo", "pretrained")
 SETTINGS = Settings()
 """Of experts that plan whole episodes by sampling."""
 RECEDING = receding.Settings()
@@ -45,23 +46,9 @@ def expert_of(env: Env, config: DataConfig) -> Expert:
 
     Raises:
         ValueError: for another name than those of EXPERTS, no iterations of one that needs them, or an environment
-            for which no expert ships.
+            that an expert does not know.
     """
-    _check(env, config)
-    if config.expert == "ilqr":
-        return Options(iterations=config.plan_iterations)
-    if config.expert == "receding":
-        search = dataclasses.replace(RECEDING.search, iterations=config.plan_iterations)
-        return dataclasses.replace(RECEDING, search=search)
-    if config.expert == "ppo":
-        settings = dataclasses.replace(LEARNED, iterations=config.plan_iterations)
-        return Learned(settings, _actor(env, settings, config.noise))
-    if config.expert == "pretrained":
-        return Learned(LEARNED, _pretrained(env))
-    search = dataclasses.replace(SETTINGS.search, iterations=config.plan_iterations)
-    return Sampling(
-        dataclasses.replace(SETTINGS, search=search), _plans(env, SETTINGS, config.noise, config.plan_batch)
-    )
+    return _kind(config).make(env, config)
 
 
 def description(env: Env, config: DataConfig) -> list:
@@ -70,31 +57,64 @@ def description(env: Env, config: DataConfig) -> list:
     Raises:
         ValueError: as `expert_of`.
     """
-    _check(env, config)
-    settings: dict[str, list] = {
-        "ilqr": [],
-        "sampling": ["sampling", repr(SETTINGS)],
-        "receding": ["receding", repr(RECEDING), env.ahead],
-        "ppo": ["ppo", repr(LEARNED)],
-    }
-    if config.expert == "pretrained":
-        return [config.noise, "pretrained", pytrees.fingerprint(_pretrained(env))]
-    return [config.noise, config.plan_iterations, *settings[config.expert]]
+    return [config.noise, *_kind(config).describe(env, config)]
 
 
-def _check(env: Env, config: DataConfig) -> None:
-    """Refuses what `expert_of` documents."""
+class Kind(NamedTuple):
+    """A kind of experts.
+
+    Attributes:
+        make: makes one for an environment.
+        describe: lists what decides what it plans, beside versions and the noise.
+        plans: whether it needs `data.plan_iterations`.
+    """
+
+    make: Callable[[Env, DataConfig], Expert]
+    describe: Callable[[Env, DataConfig], list]
+    plans: bool = True
+
+
+def _kind(config: DataConfig) -> Kind:
+    """Looks up who is to demonstrate."""
     if config.expert not in EXPERTS:
         raise ValueError(f"data.expert: got {config.expert!r}, expected one of {', '.join(EXPERTS)}")
-    if config.expert not in ("ilqr", "pretrained") and config.plan_iterations < 1:
+    kind = EXPERTS[config.expert]
+    if kind.plans and config.plan_iterations < 1:
         raise ValueError(
             f"data.plan_iterations: got {config.plan_iterations}, expected at least 1 with {config.expert}"
         )
-    if config.expert == "pretrained" and not (PRETRAINED / f"{env.name}.npz").exists():
-        there = ", ".join(sorted(path.stem for path in PRETRAINED.glob("*.npz")))
-        raise ValueError(
-            f"data.expert: got 'pretrained', expected another one with {env.name}: experts ship for {there} only"
-        )
+    return kind
+
+
+def _planned(_: Env, config: DataConfig) -> Expert:
+    return Planned(Options(iterations=config.plan_iterations))
+
+
+def _sampling(env: Env, config: DataConfig) -> Expert:
+    search = dataclasses.replace(SETTINGS.search, iterations=config.plan_iterations)
+    return Sampling(
+        dataclasses.replace(SETTINGS, search=search), _plans(env, SETTINGS, config.noise, config.plan_batch)
+    )
+
+
+def _receding(_: Env, config: DataConfig) -> Expert:
+    search = dataclasses.replace(RECEDING.search, iterations=config.plan_iterations)
+    return Receding(dataclasses.replace(RECEDING, search=search))
+
+
+def _ppo(env: Env, config: DataConfig) -> Expert:
+    settings = dataclasses.replace(LEARNED, iterations=config.plan_iterations)
+    return Learned(settings, _actor(env, settings, config.noise))
+
+
+def _pretrained(env: Env, _: DataConfig) -> Expert:
+    return Learned(LEARNED, _shipped(env))
+
+
+def _controlled(env: Env, _: DataConfig) -> Controlled:
+    if env.name != "push":
+        raise ValueError(f"data.expert: got 'controller', expected another one with {env.name}: it knows push only")
+    return CONTROLLER
 
 
 def digest(env: Env, *request: Any) -> str:
@@ -106,8 +126,14 @@ def digest(env: Env, *request: Any) -> str:
 
 
 @functools.cache
-def _pretrained(env: Env) -> learned.Actor:
-    return pytrees.read(PRETRAINED / f"{env.name}.npz", learned.shapes(env, LEARNED))
+def _shipped(env: Env) -> learned.Actor:
+    path = PRETRAINED / f"{env.name}.npz"
+    if not path.exists():
+        there = ", ".join(sorted(path.stem for path in PRETRAINED.glob("*.npz")))
+        raise ValueError(
+            f"data.expert: got 'pretrained', expected another one with {env.name}: experts ship for {there} only"
+        )
+    return pytrees.read(path, learned.shapes(env, LEARNED))
 
 
 @functools.cache
@@ -142,3 +168,14 @@ def _plans(env: Env, settings: Settings, noise: float, batch: int) -> Plans:
             f"only {succeeded} {begin} succeed, expected half of them; its costs, its steering or data.noise may be why"
         )
     return plans
+
+
+EXPERTS: dict[str, Kind] = {
+    "ilqr": Kind(_planned, lambda _, config: [config.plan_iterations]),
+    "sampling": Kind(_sampling, lambda _, config: [config.plan_iterations, "sampling", repr(SETTINGS)]),
+    "receding": Kind(_receding, lambda env, config: [config.plan_iterations, "receding", repr(RECEDING), env.ahead]),
+    "ppo": Kind(_ppo, lambda _, config: [config.plan_iterations, "ppo", repr(LEARNED)]),
+    "pretrained": Kind(_pretrained, lambda env, _: ["pretrained", pytrees.fingerprint(_shipped(env))], plans=False),
+    "controller": Kind(_controlled, lambda *run: ["controller", *_controlled(*run).tactics], plans=False),
+}
+"""By name, as in `data.expert`. Another entry is another expert."""

@@ -21,7 +21,6 @@ from milx.data.frames import frame_indices, in_chunks
 from milx.data.goals import goals
 from milx.envs.base import Env, State, Task
 from milx.trajopt.episode import judge
-from milx.trajopt.expert import choose_tactics, perform
 from milx.types import SPLITS, Demo, TaskBatch
 
 
@@ -75,20 +74,19 @@ def collect(
             with the next; None for no files.
 
     Raises:
-        ValueError: as `experts.expert_of`, and without iterations where the environment has no controller.
+        ValueError: as `experts.expert_of`.
     """
-    options, numbers = experts.expert_of(env, config), itertools.count()
+    expert, numbers = experts.expert_of(env, config), itertools.count()
     tasks, each, state, keys = _draw(env, jax.random.fold_in(key, SPLITS.index(split)), split, num_tasks, num_demos)
-    tactic = choose_tactics(env, options, each, state, config.plan_batch)
 
-    def plan_part(task: Task, state: State, key: jax.Array, tactic: Any) -> tuple[State, jax.Array]:
-        make = functools.partial(perform, env, task, state, key, options, config.noise, tactic)
+    def plan_part(task: Task, state: State, key: jax.Array) -> tuple[State, jax.Array]:
+        make = functools.partial(expert.perform, env, task, state, key, config.noise)
         if parts is None:
             return make()
         path = parts.with_name(f"{parts.name}-{next(numbers)}.npz")
         return pytrees.kept(path, make, lambda: _of_one_task(shapes(env, 1, len(key))))
 
-    states, action = map_in_chunks(plan_part, (each, state, keys, tactic), config.plan_batch)
+    states, action = map_in_chunks(plan_part, (each, state, keys), config.plan_batch)
     success, _ = map_in_chunks(functools.partial(judge, env), (each, states), config.plan_batch)
     demos, diverged = _arrange(tasks, states, action, success)
     if diverged:

@@ -35,8 +35,6 @@ class Env(World[TaskT]):
             where the goal is the end. A configuration may override it (`env.goal_step`).
         object_indices: for each of the O objects, the two entries of the state that hold its position, where the state
             tells it.
-        tactics: ways in which the controller may go about a scene, in the order of preference; what the numbers mean is
-            the controller's affair.
         long_chain: whether a step computes MJX's kinematics of more than three joints in a chain, which old CPU
             compilers must not fuse (`platform.pixel_options`).
         ahead: time steps that an expert with a receding horizon looks ahead (`milx.trajopt.receding`), at least 1; the
@@ -46,8 +44,8 @@ class Env(World[TaskT]):
             `image_to_goal` must be symmetric; what tasks draw need not be, so that a thing's mirror image may have a
             shape that no task has. None where there is no such mirror.
         action_cost: weight of the action in the planner's running cost (no unit): the lower, the faster the expert.
-        version: raised when tasks, scenes, physics, costs, the steering, the controller, or what an expert that learns
-            is told or supposes change, so that no demonstration made before it is taken for one made after it.
+        version: raised when tasks, scenes, physics, costs, the steering, or what an expert that learns is told or
+            supposes change, so that no demonstration made before it is taken for one made after it.
     """
 
     name: str
@@ -57,7 +55,6 @@ class Env(World[TaskT]):
     height_index: int | None = None
     goal_step: int | None = None
     object_indices: tuple[tuple[int, ...], ...] = ()
-    tactics: tuple[float, ...] = (0.0,)
     long_chain: bool = True
     ahead: int = 15
     mirror: tuple[tuple[int, ...], tuple[int, ...]] | None = None
@@ -129,14 +126,6 @@ class Env(World[TaskT]):
         Nothing unless overridden.
         """
         return jnp.zeros(0)
-
-    def control(self, task: TaskT, state: State, tactic: jax.Array) -> jax.Array:
-        """Returns the action [A] of a controller that knows the task, by one of the `tactics`. It may replace iLQR.
-
-        Raises:
-            ValueError: unless overridden.
-        """
-        raise ValueError(f"data.plan_iterations: got 0, expected at least 1: {self.name} has no controller")
 
     # What a benchmark asks.
 

@@ -24,7 +24,6 @@ from milx.evaluation.rollout import rollout
 from milx.methods.base import Method
 from milx.methods.random import Random
 from milx.trajopt.episode import judge
-from milx.trajopt.expert import choose_tactics, perform
 from milx.types import Demo, Params, TaskParams
 
 _LISTENERS = 24
@@ -230,18 +229,17 @@ def evaluate_baselines(env: Env, demos: DemoSet, config: EvalConfig, expert: Dat
     candidate; the expert does without noise what it planned or rehearsed.
 
     Raises:
-        ValueError: as `expert_of`, and without iterations where the environment has no controller.
+        ValueError: as `expert_of`.
     """
     num_trials = min(config.baseline_trials, config.trials)
     total = demos.num_tasks * num_trials  # said, as arrays without entries do not tell
     tasks, scenes, keys, as_it_is = _expert_inputs(env, demos.task, key, config.trials, num_trials)
-    options = expert_of(env, expert)
-    tactic = choose_tactics(env, options, tasks, scenes, expert.plan_batch)
+    demonstrator = expert_of(env, expert)
 
-    def plan(task: Task, state: State, key: jax.Array, tactic: Any) -> tuple[State, jax.Array]:
-        return perform(env, task, state, key, options, 0.0, tactic)
+    def plan(task: Task, state: State, key: jax.Array) -> tuple[State, jax.Array]:
+        return demonstrator.perform(env, task, state, key, 0.0)
 
-    states, _ = map_in_chunks(plan, (tasks, scenes, keys, tactic), expert.plan_batch)
+    states, _ = map_in_chunks(plan, (tasks, scenes, keys), expert.plan_batch)
     success, other = map_in_chunks(functools.partial(judge, env), (as_it_is, states), expert.plan_batch)
     random = run_trials(env, Random(env.action_size), {}, demos, config, key, first=num_trials)
 

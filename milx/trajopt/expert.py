@@ -1,26 +1,23 @@
-"""Experts: plan every scene once by iLQR, then run the plan's feedback with noise on the actions.
+"""Experts: who demonstrates a batch of scenes, with noise on the actions.
 
-The noise drives the arm off the plan and the recorded action is the feedback's answer, before the noise: a
-demonstration so shows how to recover, and its labels are clean (DART, Laskey et al. 2017). Where iLQR does not plan
-(no iterations) the feedback is the environment's controller, with a tactic that a rehearsal without noise chooses. An
-expert by sampling (`demonstrations.py`) does the same with its own plans and its own way to follow them, one with a
-receding horizon (`receding.py`) plans again where the noise has driven it, and one that has learned (`learned.py`) acts
-in every state.
+iLQR plans every scene once, and the plan's feedback is run. The noise drives the arm off the plan and the recorded
+action is the feedback's answer, before the noise: a demonstration so shows how to recover, and its labels are clean
+(DART, Laskey et al. 2017). An expert by sampling (`demonstrations.py`) does the same with its own plans and its own way
+to follow them, one with a receding horizon (`receding.py`) plans again where the noise has driven it, and one that has
+learned (`learned.py`) acts in every state.
 """
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from milx.core import parallel
-from milx.core.batching import map_in_chunks
 from milx.envs.base import Env, State, Task
 from milx.trajopt import demonstrations, learned, receding
-from milx.trajopt.episode import judge, problem_of
+from milx.trajopt.episode import problem_of
 from milx.trajopt.ilqr import Options, Plan, solve
 from milx.trajopt.planner import Plans, Settings
 
@@ -34,6 +31,38 @@ def plan(env: Env, task: Task, state: State, options: Options) -> Plan:
     return solve(problem_of(env.differentiable, task, state), state.vector, env.guess(task, state), options)
 
 
+class Expert(Protocol):
+    """Who demonstrates."""
+
+    def perform(self, env: Env, task: Task, state: State, key: jax.Array, noise: float) -> tuple[State, jax.Array]:
+        """Demonstrates in a batch of N scenes. Not to be called inside `jax.jit`.
+
+        Args:
+            env: the environment.
+            task: [N], what is to be done.
+            state: [N], the scenes.
+            key: [N], draw the noise.
+            noise: standard deviation of the noise on the actions, in their units.
+
+        Returns:
+            The states, with leading axes [N, T + 1], and the actions without noise [N, T, A].
+        """
+
+
+class Planned(NamedTuple):
+    """An expert that plans by iLQR and follows its plans.
+
+    Attributes:
+        options: of iLQR.
+    """
+
+    options: Options
+
+    def perform(self, env: Env, task: Task, state: State, key: jax.Array, noise: float) -> tuple[State, jax.Array]:
+        """Demonstrates, see `Expert`."""
+        return _perform_planned(env, self.options, noise, task, state, key)
+
+
 class Sampling(NamedTuple):
     """An expert that plans whole episodes by sampling.
 
@@ -44,6 +73,28 @@ class Sampling(NamedTuple):
 
     settings: Settings
     plans: Plans
+
+    def perform(self, env: Env, task: Task, state: State, key: jax.Array, noise: float) -> tuple[State, jax.Array]:
+        """Demonstrates, see `Expert`."""
+        return demonstrations.demonstrate(env, self.settings, self.plans, noise, task, state, key)
+
+
+class Receding(NamedTuple):
+    """An expert that plans the next time steps by sampling, again and again.
+
+    Attributes:
+        settings: of the planner.
+    """
+
+    settings: receding.Settings
+
+    def perform(self, env: Env, task: Task, state: State, key: jax.Array, noise: float) -> tuple[State, jax.Array]:
+        """Demonstrates, see `Expert`.
+
+        Raises:
+            ValueError: as `receding.demonstrate`.
+        """
+        return receding.demonstrate(env, self.settings, noise, task, state, key)
 
 
 class Learned(NamedTuple):
@@ -57,9 +108,11 @@ class Learned(NamedTuple):
     settings: learned.Settings
     actor: learned.Actor
 
+    def perform(self, env: Env, task: Task, state: State, key: jax.Array, noise: float) -> tuple[State, jax.Array]:
+        """Demonstrates, see `Expert`."""
+        return _perform_learned(env, self.settings, self.actor, noise, task, state, key)
 
-Expert = Options | Sampling | Learned | receding.Settings
-"""Who demonstrates: iLQR, with no iterations of which the environment's controller does, or another expert."""
+
 Feedback = Callable[[State, jax.Array], jax.Array]
 """Maps a state and the time step (int32 scalar) to an action [A]."""
 
@@ -98,73 +151,6 @@ def demonstrate(
     return jax.tree.map(lambda xs, x: jnp.concatenate([xs, x[None]]), states, last), actions
 
 
-def perform(
-    env: Env,
-    task: Task,
-    state: State,
-    key: jax.Array,
-    options: Expert,
-    noise: float,
-    tactic: np.ndarray | None = None,
-) -> tuple[State, jax.Array]:
-    """Demonstrates a batch by the expert that `options` describe.
-
-    Not to be called inside `jax.jit`.
-
-    Args:
-        env: the environment.
-        task: [N] what is to be done.
-        state: [N] the scenes.
-        key: [N] draw the noise.
-        options: of iLQR, with no iterations of which the controller acts, or of another expert.
-        noise: standard deviation of the noise, in units of the action.
-        tactic: [N], the tactics of the controller; None for those that `choose_tactics` finds.
-
-    Returns:
-        As `demonstrate`, with a leading axis [N].
-
-    Raises:
-        ValueError: for no iterations in an environment without a controller.
-    """
-    if isinstance(options, receding.Settings):
-        return receding.demonstrate(env, options, noise, task, state, key)
-    if isinstance(options, Sampling):
-        return demonstrations.demonstrate(env, options.settings, options.plans, noise, task, state, key)
-    if isinstance(options, Learned):
-        return _perform_learned(env, options.settings, options.actor, noise, task, state, key)
-    if options.iterations:
-        return _perform_planned(env, options, noise, task, state, key)
-    if tactic is None:
-        tactic = choose_tactics(env, options, task, state, len(key))
-    return _perform_controlled(env, noise, task, state, tactic, key)
-
-
-def choose_tactics(env: Env, options: Expert, task: Task, state: State, batch: int) -> np.ndarray | None:
-    """Finds, for each of N scenes, the first tactic [N] with which the controller succeeds without noise.
-
-    Where no tactic succeeds it is the first of all. Only scenes in which the tactics before have failed rehearse the
-    next one. `batch` scenes rehearse at once. Other experts than the controller have none: it is None for them.
-    """
-    if not isinstance(options, Options) or options.iterations:
-        return None
-    chosen = np.full(len(state.qpos), env.tactics[0])
-    unsolved = np.arange(len(chosen)) if len(env.tactics) > 1 else np.array([], int)
-
-    def rehearse(tactic: float, task: Task, state: State) -> jax.Array:
-        count = len(state.qpos)
-        keys = jax.random.split(jax.random.key(0), count)  # of noise that is multiplied by zero
-        states, _ = _perform_controlled(env, 0.0, task, state, np.full(count, tactic), keys)
-        return judge(env, task, states)[0]
-
-    for tactic in env.tactics:
-        if len(unsolved):
-            try_tactic = functools.partial(rehearse, tactic)
-            success = np.asarray(map_in_chunks(try_tactic, (task, state), batch, counted=False, rows=unsolved))
-            chosen[unsolved[success]] = tactic
-            unsolved = unsolved[~success]
-    return chosen
-
-
 @functools.partial(jax.jit, static_argnums=(0, 1))
 def _perform_planned(env: Env, options: Options, noise: float, *batch: Any) -> tuple[State, jax.Array]:
     def one(noise: float, task: Task, state: State, key: jax.Array) -> tuple[State, jax.Array]:
@@ -183,11 +169,3 @@ def _perform_learned(
         )
 
     return parallel.shard_tasks(jax.vmap(one, in_axes=(None, None, 0, 0, 0)), shared=2)(actor, noise, *batch)
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _perform_controlled(env: Env, noise: float, *batch: Any) -> tuple[State, jax.Array]:
-    def one(noise: float, task: Task, state: State, tactic: jax.Array, key: jax.Array) -> tuple[State, jax.Array]:
-        return demonstrate(env, task, state, lambda state, _: env.control(task, state, tactic), key, noise)
-
-    return parallel.shard_tasks(jax.vmap(one, in_axes=(None, 0, 0, 0, 0)), shared=1)(noise, *batch)

@@ -12,6 +12,7 @@ from milx.config import assemble, registry
 from milx.config.assemble import default_config, make_config, overrides
 from milx.config.check import check_config
 from milx.config.registry import PRESETS
+from milx.config.schema import DataConfig
 from milx.types import Spec
 
 ALL = [(env, preset) for env, presets in PRESETS.items() for preset in presets]
@@ -161,6 +162,9 @@ def test_configurations_of_all_results_and_shipped_policies_load():
         config, old = assemble.from_dict(values), assemble.flatten(values)
         versions.add(values.get("config_version", 1))
         for name, value in assemble.fields(config).items():
+            if (name, value) == ("data.expert", "controller"):
+                assert old["data.plan_iterations"] == 0
+                continue
             before = [group.replace("method.", "mil.") for group in (name, name.replace("method.imi", "train.imi"))]
             found = [old[each] for each in (name, *before) if each in old]
             assert not found or all(_as_json(value) == each for each in found), name
@@ -186,6 +190,13 @@ def test_settings_that_attention_had_in_version_2_are_dropped():
         assemble.from_dict(values | {"config_version": 3})
 
 
+def test_the_controller_of_version_3_is_an_expert_with_a_name():
+    values = {"config_version": 3, "data": {"plan_iterations": 0, "noise": 0.1}}
+    assert assemble.from_dict(values).data == DataConfig(expert="controller", plan_iterations=0, noise=0.1)
+    for data in ({"plan_iterations": 1}, {"plan_iterations": 0, "expert": "sampling"}):
+        assert assemble.from_dict(values | {"data": data}).data.expert == data.get("expert", "ilqr")
+
+
 def test_an_unknown_field_is_ignored_if_it_is_none():
     values = assemble.to_dict(default_config("mil"))
     values["env"]["goal_within"] = None
@@ -201,5 +212,5 @@ def test_a_method_that_is_no_name_is_refused():
 
 
 def test_a_later_layout_is_refused():
-    with pytest.raises(ValueError, match="config_version: got 99, expected at most 3: made by a later milx"):
+    with pytest.raises(ValueError, match="config_version: got 99, expected at most 4: made by a later milx"):
         assemble.from_dict({"config_version": 99})

@@ -12,6 +12,7 @@ from milx.config.schema import DataConfig
 from milx.data import experts
 from milx.data.simulated import collect
 from milx.trajopt import learned, receding
+from milx.trajopt.expert import Planned
 from milx.trajopt.ilqr import Options
 from milx.trajopt.planner import Plans, Settings
 
@@ -36,6 +37,15 @@ def env():
             "data.plan_iterations: got 0, expected at least 1 with receding",
         ),
         ({"expert": "ppo", "plan_iterations": 0}, "data.plan_iterations: got 0, expected at least 1 with ppo"),
+        ({"plan_iterations": 0}, "data.plan_iterations: got 0, expected at least 1 with ilqr"),
+        (
+            {"expert": "pretrained"},
+            "data.expert: got 'pretrained', expected another one with place: experts ship for push only",
+        ),
+        (
+            {"expert": "controller"},
+            "data.expert: got 'controller', expected another one with place: it knows push only",
+        ),
     ],
 )
 def test_what_no_expert_understands_is_refused(env, changes, message):
@@ -45,13 +55,13 @@ def test_what_no_expert_understands_is_refused(env, changes, message):
 
 
 def test_ilqr_has_the_iterations_of_the_settings(env):
-    assert experts.expert_of(env, DataConfig(plan_iterations=7)) == Options(iterations=7)
+    assert experts.expert_of(env, DataConfig(plan_iterations=7)) == Planned(Options(iterations=7))
     assert experts.description(env, DataConfig(noise=0.2, plan_iterations=7)) == [0.2, 7]
 
 
 def test_a_receding_horizon_has_the_iterations_of_the_settings(env):
     expert = experts.expert_of(env, DataConfig(expert="receding", plan_iterations=3))
-    assert expert == receding.Settings(search=dataclasses.replace(receding.SEARCH, iterations=3))
+    assert expert.settings == receding.Settings(search=dataclasses.replace(receding.SEARCH, iterations=3))
 
 
 def test_all_that_decides_on_demonstrations_by_sampling_describes_them(env, monkeypatch):
@@ -149,13 +159,6 @@ def test_an_expert_learns_once_and_is_kept(env, tmp_path, monkeypatch, capsys):
     expected = "the expert of place has learned nothing: an episode costs 2 at the end, and cost 2 at the beginning"
     assert expected in capsys.readouterr().err
     experts._actor.cache_clear()
-
-
-def test_no_expert_ships_for_place(env):
-    expected = "data.expert: got 'pretrained', expected another one with place: experts ship for push only"
-    for ask in (experts.expert_of, experts.description):
-        with pytest.raises(ValueError, match=expected):
-            ask(env, DataConfig(expert="pretrained"))
 
 
 @pytest.mark.slow

@@ -11,6 +11,7 @@ import pytest
 from milx.core import pytrees
 from milx.data import simulated as demos_lib
 from milx.data.frames import frame_indices
+from milx.trajopt.expert import Planned
 
 MANY = 4
 
@@ -134,7 +135,7 @@ def test_cache_notices_other_arguments(trained, tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_planning_that_was_killed_goes_on_with_the_next_part(trained, tmp_path, monkeypatch, capsys):
     """Plans 24 demonstrations, 10 at once; the second part is damaged meanwhile."""
-    perform, calls = demos_lib.perform, []
+    perform, calls = Planned.perform, []
 
     def killed(*arguments):
         calls.append(arguments)
@@ -142,7 +143,7 @@ def test_planning_that_was_killed_goes_on_with_the_next_part(trained, tmp_path, 
             raise KeyboardInterrupt
         return perform(*arguments)
 
-    monkeypatch.setattr(demos_lib, "perform", killed)
+    monkeypatch.setattr(Planned, "perform", killed)
     arguments = (tmp_path, trained.run.env, trained.config.seed, "train", 8, 3, trained.config.data)
     with pytest.raises(KeyboardInterrupt):
         demos_lib.cached(*arguments)
@@ -161,12 +162,12 @@ def test_demonstrations_that_diverge_are_dropped_and_counted(trained, monkeypatc
     """Plans eight demonstrations, of which the third leaves the world and the fifth loses an action."""
     env, config = trained.run.env, dataclasses.replace(trained.config.data, plan_batch=8)
 
-    def diverge(env, task, state, key, options, noise, tactic):
+    def diverge(self, env, task, state, key, noise):
         states = jax.tree.map(lambda x: jnp.repeat(x[:, None], env.horizon + 1, axis=1), state)
         qpos = states.qpos.at[2, 30].set(jnp.inf)
         return dataclasses.replace(states, qpos=qpos), jnp.ones((8, env.horizon, 2)).at[4, 7, 1].set(jnp.nan)
 
-    monkeypatch.setattr(demos_lib, "perform", diverge)
+    monkeypatch.setattr(Planned, "perform", diverge)
     monkeypatch.setattr(demos_lib, "judge", lambda env, task, states: (jnp.ones(8, bool), {}))
     demos = demos_lib.collect(env, jax.random.key(0), "train", 4, 2, config)
     assert "2 of 8 demonstrations diverged and are dropped" in capsys.readouterr().err

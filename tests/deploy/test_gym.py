@@ -11,6 +11,7 @@ from gymnasium.utils.env_checker import check_env
 from milx import envs, gym
 from milx.config.schema import DataConfig
 from milx.gym import GymEnv
+from milx.trajopt.expert import Planned
 
 
 @pytest.fixture(scope="module")
@@ -90,11 +91,11 @@ def test_a_demonstration_is_of_the_same_task_in_another_scene(gym_env, monkeypat
     """Replaces the planner, which has tests of its own, by one that stands still and records what it was asked."""
     asked = {}
 
-    def stand_still(env, task, scene, key, options, noise):
-        asked.update(task=task, scene=scene, iterations=options.iterations, noise=noise)
+    def stand_still(self, env, task, scene, key, noise):
+        asked.update(task=task, scene=scene, iterations=self.options.iterations, noise=noise)
         return jax.tree.map(lambda x: np.repeat(x[:, None], env.horizon + 1, axis=1), scene), np.zeros((1, 50, 2))
 
-    monkeypatch.setattr(gym, "perform", stand_still)
+    monkeypatch.setattr(Planned, "perform", stand_still)
     gym_env.reset(seed=2)
     demo = gym_env.demonstrate(DataConfig(plan_iterations=8, noise=0.3))
     jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[0], b), asked["task"], gym_env._task)

@@ -13,14 +13,14 @@ import pytest
 from mujoco import mjx
 
 from milx.data.goals import goals
+from milx.data.push_controller import CONTROLLER, TACTICS, Controlled, control
 from milx.envs.base import State
 from milx.envs.push import env as push
 from milx.envs.push.env import NUM_JOINTS, Push
 from milx.envs.shapes import BY_SPLIT, SHAPES
 from milx.envs.shapes.primitives import NUM_CAPSULES, to_geoms
 from milx.render.scene import Renderer, to_uint8
-from milx.trajopt.expert import VERSION, perform
-from milx.trajopt.ilqr import Options
+from milx.trajopt.expert import VERSION
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -108,7 +108,7 @@ def shown(env):
     """Samples tasks, and demonstrations of them by the controller with noise on its actions."""
     tasks = jax.vmap(env.sample_task, in_axes=(0, None))(jax.random.split(jax.random.key(8), 32), "train")
     scenes, keys = scenes_of(env, tasks)
-    return tasks, *perform(env, tasks, scenes, keys, Options(iterations=0), 0.1)
+    return tasks, *CONTROLLER.perform(env, tasks, scenes, keys, 0.1)
 
 
 def test_what_is_planned_is_what_its_version_says(env, shown):
@@ -135,14 +135,13 @@ def test_the_controller_pushes_most_objects_to_the_goal_in_spite_of_noise(env, s
 
 
 @pytest.mark.slow
-def test_a_tactic_is_how_far_to_the_side_of_the_objects_center_the_hand_meets_it(env, shown, monkeypatch):
+def test_a_tactic_is_how_far_to_the_side_of_the_objects_center_the_hand_meets_it(env, shown):
     """Measures to the left of the hand's view of the goal. Of 32 means under noise, 4 mm are three deviations."""
     tasks, _, _ = shown
     scenes, keys = scenes_of(env, tasks)
     rows, met = np.arange(len(keys)), []
     for tactic in (0.02, -0.02):
-        monkeypatch.setattr(env, "tactics", (tactic,))
-        states, _ = perform(env, tasks, scenes, keys, Options(iterations=0), 0.1)
+        states, _ = Controlled(control, (tactic,)).perform(env, tasks, scenes, keys, 0.1)
         objects = np.asarray(jax.vmap(jax.vmap(env.objects))(states))[rows, :, tasks.target]
         moved = np.argmax(np.linalg.norm(np.diff(objects, axis=1), axis=-1) > 1e-4, axis=1)
         tip = np.asarray(jax.vmap(jax.vmap(env.robot_state))(states))[rows, moved, 14:16]
@@ -155,12 +154,13 @@ def test_a_tactic_is_how_far_to_the_side_of_the_objects_center_the_hand_meets_it
 @pytest.mark.slow
 def test_demonstrations_record_the_controllers_answers_before_the_noise(env, shown):
     tasks, states, action = shown
-    answers = jax.jit(jax.vmap(jax.vmap(jax.vmap(env.control, (None, None, 0)), (None, 0, None)), (0, 0, None)))
+    answer = functools.partial(control, env)
+    answers = jax.jit(jax.vmap(jax.vmap(jax.vmap(answer, (None, None, 0)), (None, 0, None)), (0, 0, None)))
     few, before = jax.tree.map(lambda x: x[:8], tasks), jax.tree.map(lambda x: x[:8, :-1], states)
-    off = np.abs(answers(few, before, jnp.array(env.tactics)) - action[:8, :, None]).max(axis=(1, 3))
+    off = np.abs(answers(few, before, jnp.array(TACTICS)) - action[:8, :, None]).max(axis=(1, 3))
     assert off.min(axis=1).max() < 1e-9, "one and the same tactic all the time"
     scenes, keys = scenes_of(env, tasks)
-    quiet, quiet_action = perform(env, tasks, scenes, keys, Options(iterations=0), 0.0)
+    quiet, quiet_action = CONTROLLER.perform(env, tasks, scenes, keys, 0.0)
     np.testing.assert_allclose(action[:, 0], quiet_action[:, 0], atol=1e-9)
     off = np.linalg.norm(quiet.qvel[:, 1, :NUM_JOINTS] - states.qvel[:, 1, :NUM_JOINTS], axis=-1)
     assert off.min() > 1e-4, "noise moves the arm"

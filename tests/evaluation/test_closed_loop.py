@@ -20,6 +20,7 @@ from milx.methods import Method
 from milx.methods.chunks import Chunked
 from milx.methods.whitening import Whitening
 from milx.training import simulated
+from milx.trajopt.expert import Planned
 
 # Wilson's interval of k successes in n trials, to four digits; by hand, 0/n ends at z^2 / (n + z^2).
 KNOWN = {
@@ -155,12 +156,12 @@ def test_baselines_run_in_the_first_trials(trained, monkeypatch, trials, asked, 
     config = dataclasses.replace(trained.config.evaluation, trials=trials, baseline_trials=asked)
     asked_for = {}
 
-    def watch(env, task, scene, keys, options, noise, tactic):
+    def watch(self, env, task, scene, keys, noise):
         asked_for.update(task=task, scene=scene)
         assert noise == 0.0
         return jax.tree.map(lambda x: jnp.repeat(x[:, None], env.horizon + 1, axis=1), scene), None
 
-    monkeypatch.setattr(closed_loop, "perform", watch)
+    monkeypatch.setattr(Planned, "perform", watch)
     plans = dataclasses.replace(trained.config.data, plan_batch=2 * 3 * tried)
     rates = closed_loop.evaluate_baselines(env, trained.test, config, plans, key).success
     scene = closed_loop.trial_scenes(env, trained.test.task, jax.random.split(key)[0], trials)

@@ -8,7 +8,6 @@ import planned
 import pytest
 
 import milx
-from milx.envs.reach.env import Reach
 from milx.trajopt import expert
 from milx.trajopt.ilqr import Options
 
@@ -100,39 +99,3 @@ def test_the_arm_is_driven_by_the_recorded_action_plus_noise(env, demonstrations
     # Four standard errors of a standard deviation and of a mean; 2% because a step is not quite affine in the action.
     np.testing.assert_allclose(noise.std(), NOISE, rtol=4 / np.sqrt(2 * noise.size) + 0.02)
     np.testing.assert_allclose(noise.mean(), 0, atol=4 * NOISE / np.sqrt(noise.size))
-
-
-def test_without_a_plan_there_must_be_a_controller(env):
-    keys = jax.random.split(jax.random.key(0), 1)
-    task = jax.vmap(env.sample_task, in_axes=(0, None))(keys, "train")
-    scene = jax.jit(jax.vmap(env.reset))(keys, task)
-    with pytest.raises(ValueError, match=r"data\.plan_iterations: got 0, expected at least 1: reach has no controller"):
-        expert.perform(env, task, scene, keys, Options(iterations=0), 0.0)
-
-
-class Turning(Reach):
-    """The tactic is the shoulder's motor command. Success: the shoulder ends turned towards the first cube's side."""
-
-    tactics = (0.0, 0.3, -0.3, 0.6)
-
-    def control(self, task, state, tactic):
-        return jnp.stack([tactic, 0.0])
-
-    def success(self, task, states):
-        x, y, _ = states.mocap_pos[0, 0]
-        return (x < 0.1) & (states.qpos[-1, 0] * jnp.sign(y) > 0.01)
-
-
-@pytest.mark.slow
-def test_the_controller_gets_the_first_tactic_that_succeeds_in_rehearsal():
-    env, keys = Turning((8, 10)), jax.random.split(jax.random.key(3), 24)
-    tasks = jax.vmap(env.sample_task, in_axes=(0, None))(keys, "train")
-    scenes = jax.vmap(env.reset)(keys, tasks)
-    x, y, _ = np.moveaxis(scenes.mocap_pos[:, 0], -1, 0)
-    expected = np.where(x < 0.1, np.where(y > 0, 0.3, -0.3), 0.0)
-    assert set(np.unique(expected)) == {-0.3, 0.0, 0.3}
-    controller = Options(iterations=0)
-    np.testing.assert_array_equal(expert.choose_tactics(env, controller, tasks, scenes, 7), expected)
-    assert expert.choose_tactics(env, Options(iterations=1), tasks, scenes, 7) is None
-    _, action = expert.perform(env, tasks, scenes, keys, controller, NOISE)
-    np.testing.assert_allclose(action[..., 0], np.broadcast_to(expected[:, None], action.shape[:2]), rtol=1e-6)

@@ -16,7 +16,7 @@ from milx.envs.shapes import SHAPES
 from milx.envs.shapes.primitives import distance_to_outline, to_geoms
 from milx.networks.mlp import MLP
 from milx.trajopt import learned, ppo
-from milx.trajopt.expert import Learned, perform
+from milx.trajopt.expert import Learned
 from milx.trajopt.learned import Settings
 
 NOISE = 0.05
@@ -153,7 +153,7 @@ def test_demonstrations_record_all_but_the_noise(cart, scenes, found):
     expert = Learned(SETTINGS, found[0])
 
     def demonstrate(noise, task, start, keys):
-        return perform(cart, task, start, keys, expert, noise)
+        return expert.perform(cart, task, start, keys, noise)
 
     cart_laws.check_that_noise_alone_is_not_recorded(demonstrate, scenes, NOISE)
     cart_laws.check_that_noise_alone_tells_demonstrations_of_a_scene_apart(demonstrate, scenes, NOISE)

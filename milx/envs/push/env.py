@@ -11,7 +11,7 @@ import numpy as np
 from milx.core.mjx import mjx
 from milx.envs.base import ASSETS, OUT_OF_THE_WAY, Env, State, check_split
 from milx.envs.chain import Chain
-from milx.envs.push import controller, steering
+from milx.envs.push import steering
 from milx.envs.shapes import BY_SPLIT, SHAPES
 from milx.envs.shapes.primitives import NUM_CAPSULES, SLOTS, Geoms, to_geoms
 from milx.envs.steering import Steering
@@ -96,7 +96,6 @@ class Push(Env[PushTask]):
     state_size = 20
     goal_indices = (14, 15)
     height_index = 16
-    tactics = (0.0, 0.02, -0.02)
     action_cost = 0.1
     version = 4
 
@@ -104,7 +103,6 @@ class Push(Env[PushTask]):
         super().__init__(_build(), image_shape)
         model = self.mj_model
         self._rgba = jnp.asarray(model.geom_rgba, float)
-        self._prong = float(model.geom("prong_middle").size[0])
         self._arm = Chain(model, "tip")
         self._body = np.array([model.body(name).id for name in _OBJECTS])
         self._dof = np.array([model.jnt_dofadr[model.body_jntadr[body]] + np.arange(3) for body in self._body])
@@ -250,28 +248,6 @@ class Push(Env[PushTask]):
         cos, sin = jnp.cos(turn), jnp.sin(turn)
         along = shape.ends @ (jnp.array([[cos, sin], [-sin, cos]]) @ directions.T)  # as the object sees them
         return task.size[task.target] * (along.max(axis=1) + shape.radius[:, None]).max(axis=0)
-
-    def guess(self, task: PushTask, state: State) -> jax.Array:
-        """Returns [T, 7], what `controller.torque` does from here."""
-        tactic = jnp.asarray(self.tactics[0])
-
-        def step(state: State, _: None) -> tuple[State, jax.Array]:
-            action = self.control(task, state, tactic)
-            return self.step(task, state, action), action
-
-        return jax.lax.scan(step, state, length=self.horizon)[1]
-
-    def control(self, task: PushTask, state: State, tactic: jax.Array) -> jax.Array:
-        """Returns [7], what `controller.torque` does in one state, `tactic` (m) to the side of the object's center."""
-        target = task.target
-        place = self.objects(state)[target, :2]
-        pose, jacobian = self.hand(state.qpos), jax.jacfwd(self.hand)(state.qpos[:NUM_JOINTS])
-        ahead = -place / jnp.maximum(jnp.linalg.norm(place), 0.02)
-        outline = self.outline(task, state, -ahead[None])[0]
-        joints, velocity = self.model.dof_damping[:NUM_JOINTS], state.qvel[:NUM_JOINTS]
-        touching, friction = outline + self._prong, task.damping[target]
-        torque = controller.torque(pose, jacobian, velocity, joints, place, ahead, touching, tactic, friction)
-        return jnp.clip(torque / self.mj_model.actuator_gear[:, 0], *self.action_range)
 
     def running_residual(self, task: PushTask, state: State, action: jax.Array, t: jax.Array) -> jax.Array:
         """Returns [12]: object from goal, tip from object, the tip's height (m), and the action; weighted.

@@ -9,6 +9,7 @@ _WORLD: Overrides = {
     "data.demos_per_task": 12,
     "data.noise": 0.1,
     "data.spare_demos": 2,
+    "data.expert": "controller",
     "data.plan_iterations": 0,
     "evaluation.tasks": 740,
     "evaluation.trials": 6,
