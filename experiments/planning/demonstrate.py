@@ -40,12 +40,7 @@ from milx.trajopt.expert import Sampling
 FIRST_SEED = 1000
 """Of the scenes; push.py and the trials by which settings were chosen have smaller ones."""
 ITERATIONS = {"sampling": 8, "receding": 1, "ppo": 500, "pretrained": 1}
-SETTINGS = {
-    "sampling": experts.SETTINGS,
-    "receding": experts.RECEDING,
-    "ppo": experts.LEARNED,
-    "pretrained": experts.LEARNED,
-}
+SETTINGS = {"sampling": experts.SETTINGS, "receding": experts.RECEDING, "ppo": experts.LEARNED}
 
 
 def measure(env: Env, config: DataConfig, scenes: int) -> Iterator[dict[str, Any]]:
@@ -87,8 +82,11 @@ def main(_: list[str]) -> None:
         config = dataclasses.replace(config, **changes)
         env, settings = envs.make(name, (16, 16)), {"first_seed": FIRST_SEED, "physics": _PHYSICS.value}
         env = env.by_warp() if _PHYSICS.value == "warp" else env
-        of_expert: Any = SETTINGS[expert]
-        settings |= dataclasses.asdict(of_expert) | ({"ahead": env.ahead} if expert == "receding" else {})
+        if expert == "pretrained":
+            settings["actor"] = experts.description(env, config)[-1]
+        else:
+            of_expert: Any = SETTINGS[expert]
+            settings |= dataclasses.asdict(of_expert) | ({"ahead": env.ahead} if expert == "receding" else {})
         for found in measure(env, config, _SCENES.value):
             said = {"env": name, "data": dataclasses.asdict(config), "settings": settings}
             result = {**said, **found, **origin}

@@ -42,11 +42,12 @@ def expert_of(env: Env, config: DataConfig) -> Expert:
     user's cache.
 
     It says so if fewer than half of these plans succeed. The first expert by policy optimization learns, under the same
-    noise, and is kept there, too. It says so if it costs no less than at the beginning.
+    noise, and is kept there, too. The process in which it learns says so if it costs no less than at the beginning.
 
     Raises:
         ValueError: for another name than those of EXPERTS, no iterations of one that needs them, or an environment
             that an expert does not know.
+        FileError: if the file of an expert that ships cannot be read, or is of other types or sizes, as under x64.
     """
     return _kind(config).make(env, config)
 
@@ -55,7 +56,7 @@ def description(env: Env, config: DataConfig) -> list:
     """Lists what decides, beside versions, what an expert plans.
 
     Raises:
-        ValueError: as `expert_of`.
+        ValueError, FileError: as `expert_of`.
     """
     return [config.noise, *_kind(config).describe(env, config)]
 
@@ -143,7 +144,7 @@ def _actor(env: Env, settings: learned.Settings, noise: float) -> learned.Actor:
     def make() -> learned.Actor:
         with progress.phase(Console(), f"learning to demonstrate {env.name}", settings.iterations):
             actor, costs = learned.learn(env, settings, noise, jax.random.key(0))
-        if not costs[-1] < costs[0]:
+        if len(costs) > 1 and not costs[-1] < costs[0]:
             warn(
                 f"the expert of {env.name} has learned nothing: an episode costs {costs[-1]:.3g} at the end, and cost "
                 f"{costs[0]:.3g} at the beginning; its costs, its steering or data.noise may be why"

@@ -116,7 +116,9 @@ class Env(World[TaskT]):
     def misjudge(self, key: jax.Array, state: State) -> State:
         """Moves things to where an expert that learns supposes them (`milx.trajopt.learned`).
 
-        With the same key they are off by as much in every state. The same state unless overridden.
+        With the same key they are off by as much in every state. A policy is led astray by errors that are several
+        times as large, of every entry of the state, so angles and quaternions should stay. The same state unless
+        overridden.
         """
         return state
 

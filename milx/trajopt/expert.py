@@ -21,9 +21,9 @@ from milx.trajopt.episode import problem_of
 from milx.trajopt.ilqr import Options, Plan, solve
 from milx.trajopt.planner import Plans, Settings
 
-VERSION = 3
-"""Of all that plans, learns and demonstrates: raised when it does so differently with the same settings, so that no
-demonstration planned before it is taken for one planned after it."""
+VERSION = 4
+"""Of all that plans, learns and demonstrates, the controller of push included: raised when it does so differently with
+the same settings, so that no demonstration planned before it is taken for one planned after it."""
 
 
 def plan(env: Env, task: Task, state: State, options: Options) -> Plan:

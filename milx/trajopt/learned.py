@@ -1,9 +1,10 @@
 """Learns an expert that acts in every state: a network that minimizes an environment's cost by policy optimization.
 
-Episodes begin in scenes of training tasks, half of them after the policy has gone astray, since it supposed things far
-from where they are: so it learns to recover, for example from beyond a thing that it was to push. In each time step the
-policy draws controls, which the environment's steering turns into an action a_t; noise is added to it, as in
-demonstrations, and `Env.approximate_step` follows. The rewards are minus the costs of the planners,
+Episodes begin in scenes of training tasks. In environments that say how things may be misjudged, half of them begin
+after the policy has gone astray, since it supposed things far from where they are: so it learns to recover, for example
+from beyond a thing that it was to push. In each time step of an episode the policy draws controls, which the
+environment's steering turns into an action a_t; noise is added to it, as in demonstrations, and `Env.approximate_step`
+follows. The rewards are minus the costs of the planners,
 
     r_t = -|running_residual(x_t, a_t, t)|^2 / 2,    of which the last has -|terminal_residual(x_T)|^2 / 2 besides,
 
@@ -48,7 +49,7 @@ class Settings:
         iterations: how often episodes are run and the policy is improved.
         episodes: N, in each iteration, rounded up to a multiple of the number of devices.
         astray: how long the policy goes astray, drawn uniformly up to this part of the horizon. It does not learn from
-            that time.
+            that time, in which no noise is added.
         width: units of each of three hidden layers.
         deviation: standard deviation of the controls at first, in halves of their range.
         least: their least standard deviation; one that has come down to it stays there.
@@ -243,7 +244,8 @@ def _episode(
         after = env.approximate_step(task, state, choose(state, far, t, key)[-1])
         return jax.tree.map(lambda new, old: jnp.where(t < until, new, old), after, state), None
 
-    most, (until_key, far_key, stray_key) = round(settings.astray * env.horizon), jax.random.split(astray_key, 3)
+    most = 0 if type(env).misjudge is Env.misjudge else round(settings.astray * env.horizon)
+    until_key, far_key, stray_key = jax.random.split(astray_key, 3)
     until = jax.random.randint(until_key, (), -most, most + 1)
     keys = jax.random.split(stray_key, most)
     start = jax.lax.scan(stray, env.reset(scene_key, task), (jnp.arange(most), keys))[0]

@@ -161,9 +161,22 @@ def test_an_expert_learns_once_and_is_kept(env, tmp_path, monkeypatch, capsys):
     experts._actor.cache_clear()
 
 
+def test_all_that_decides_describes_experts_that_need_no_iterations(monkeypatch):
+    push = milx.make("push", (8, 8))
+    described = [experts.description(push, DataConfig(expert=name)) for name in ("pretrained", "controller")]
+    others = jax.tree.map(lambda x: x + 1, experts._shipped(push))
+    monkeypatch.setattr(experts, "_shipped", lambda env: others)
+    monkeypatch.setattr(experts, "CONTROLLER", experts.CONTROLLER._replace(tactics=(0.0, 0.01)))
+    described += [experts.description(push, DataConfig(expert=name)) for name in ("pretrained", "controller")]
+    described.append(experts.description(push, DataConfig(expert="controller", noise=0.3)))
+    assert all(one != other for i, one in enumerate(described) for other in described[:i])
+    again = experts.description(push, DataConfig(expert="controller", noise=0.3, plan_iterations=3))
+    assert again == described[-1]
+
+
 @pytest.mark.slow
 def test_the_expert_that_ships_pushes():
-    """Uses the preset's noise, and shapes that the expert did not learn with, of which it fails in one of a hundred."""
+    """Uses the preset's noise, and shapes that the expert did not learn with, of which it fails in one of 250."""
     settings = {"expert": "pretrained", "plan_batch": 24}
     config = dataclasses.replace(make_config("push", preset="fast").data, **settings)
     demos = collect(milx.make("push", (8, 8)), jax.random.key(3), "validation", 12, 2, config)
