@@ -236,9 +236,10 @@ class Push(Env[PushTask]):
         return self._advance(model.replace(opt=cheaper), state, action, _FEWER_STEPS)
 
     def manner(self, task: PushTask, state: State) -> jax.Array:
-        """Returns [1], how far the tip is below the height at which it is to travel, weighted (m).
+        """Returns [1], how far the tip is below the height at which it is to travel; weighted.
 
-        That is twice as far above PUSH_HEIGHT as the tip is from the target's center, less CLOSE, up to TRAVEL_HEIGHT.
+        It is TRAVEL_COST min(z - h, 0), where h = PUSH_HEIGHT + clip(2 (d - CLOSE), 0, TRAVEL_HEIGHT), z is the height
+        of the tip, and d its distance from the target's center, seen from above (m).
         """
         place, tip = self.objects(state)[task.target, :2], self.hand(state.qpos)[:3]
         away = jnp.sqrt(jnp.square(tip[:2] - place).sum() + 1e-8)
