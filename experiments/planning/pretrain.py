@@ -1,7 +1,7 @@
 """Learns an expert by policy optimization, and puts it where experts ship (`data.expert=pretrained`).
 
     python experiments/planning/pretrain.py              # push, on a GPU
-    python experiments/planning/pretrain.py --env=place --out=/tmp/actors
+    python experiments/planning/pretrain.py --env=place --out=actors
 
 It is the expert of a run with `data.expert=ppo`, the noise of the preset `fast` and as many iterations as in
 `demonstrate.py`, from the user's cache if it is there already.
