@@ -113,13 +113,6 @@ class Env(World[TaskT]):
         """
         return self.step(task, state, action)
 
-    def manner(self, task: TaskT, state: State) -> jax.Array:
-        """Returns a residual [M] that is added to the running one of an expert that learns, once half of it is learned.
-
-        It says how a demonstration should look that others can imitate. Nothing unless overridden.
-        """
-        return jnp.zeros(0)
-
     def misjudge(self, key: jax.Array, state: State) -> State:
         """Moves things to where an expert that learns supposes them (`milx.trajopt.learned`).
 

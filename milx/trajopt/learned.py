@@ -8,14 +8,13 @@ follows. The rewards are minus the costs of the planners,
 
     r_t = -|running_residual(x_t, a_t, t)|^2 / 2,    of which the last has -|terminal_residual(x_T)|^2 / 2 besides,
 
-and `ppo.py` maximizes their discounted sum; a_t is clipped to its range, and is without the noise. In the second half
-of the iterations the residual of `Env.manner` is one more part of the running one. The policy sees what the robot knows
-of itself, the positions of everything, the residual of the running cost at time 0 without an action, which tells what
-is to be done, and what `Env.visible` adds. It is told the velocities of other things only where that residual has them,
-since a single image does not show these. It supposes things where they are not (`Env.misjudge`), as those who imitate
-it from images do, so it learns to act with a margin; when it demonstrates, it sees them where they are. The critic sees
-both, all velocities and the time. Everything is whitened by the mean and the standard deviation over all episodes so
-far. An episode that diverges is replaced by another one.
+and `ppo.py` maximizes their discounted sum; a_t is clipped to its range, and is without the noise. The policy sees what
+the robot knows of itself, the positions of everything, the residual of the running cost at time 0 without an action,
+which tells what is to be done, and what `Env.visible` adds. It is told the velocities of other things only where that
+residual has them, since a single image does not show these. It supposes things where they are not (`Env.misjudge`), as
+those who imitate it from images do, so it learns to act with a margin; when it demonstrates, it sees them where they
+are. The critic sees both, all velocities and the time. Everything is whitened by the mean and the standard deviation
+over all episodes so far. An episode that diverges is replaced by another one.
 """
 
 import dataclasses
@@ -223,7 +222,6 @@ def _episode(
     task_key, scene_key, error_key, step_key, astray_key = jax.random.split(key, 5)
     task, steering = env.sample_task(task_key, "train"), env.steering
     low, high = env.action_range
-    late = moments.iterations >= settings.iterations / 2
 
     def choose(state: State, supposed: State, t: jax.Array, key: jax.Array) -> tuple[jax.Array, ...]:
         seen = jnp.concatenate([see(env, task, supposed), see(env, task, state), state.qvel, t[None] / env.horizon])
@@ -235,8 +233,7 @@ def _episode(
         t, key = inputs
         control_key, noise_key = jax.random.split(key)
         seen, control, action = choose(state, env.misjudge(error_key, state), t, control_key)
-        cost = jnp.square(env.running_residual(task, state, action, t)).sum()
-        reward = -(cost + late * jnp.square(env.manner(task, state)).sum()) / 2
+        reward = -jnp.square(env.running_residual(task, state, action, t)).sum() / 2
         after = env.approximate_step(task, state, action + noise * jax.random.normal(noise_key, action.shape))
         return after, (seen, control, reward)
 

@@ -51,9 +51,6 @@ class Cart:
     def misjudge(self, key, state):
         return dataclasses.replace(state, qpos=state.qpos + 0.02 * jax.random.normal(key, (1,)))
 
-    def manner(self, task, state):
-        return jnp.zeros(0)
-
     def visible(self, task, state):
         return jnp.zeros(0)
 

@@ -133,21 +133,6 @@ def test_half_of_the_episodes_begin_where_the_policy_has_gone_astray(cart, found
     assert 0.01 < astray[astray > 0].mean() < 0.1, "five times 0.02 is as far as it would go"
 
 
-def test_the_manner_counts_in_the_second_half(cart, found, monkeypatch):
-    """Half the square of a residual of 2 in each time step, from the 40th of 80 iterations on."""
-    params = {"policy": found[0].params, "deviation": jnp.log(jnp.full(1, 0.1))}
-    params["critic"] = MLP(1, SETTINGS.width).init(jax.random.key(0), jnp.zeros(12))
-
-    def rewards(iterations, manner):
-        monkeypatch.setattr(cart, "manner", lambda task, state: jnp.full(1, manner))
-        moments = found[0].moments._replace(iterations=jnp.asarray(float(iterations)))
-        return learned._episode(cart, SETTINGS, NOISE, moments, params, jax.random.key(5))[2]
-
-    without = rewards(39, 0.0)
-    np.testing.assert_allclose(rewards(39, 2.0), without, rtol=1e-6)
-    np.testing.assert_allclose(rewards(40, 2.0), without - 2.0, rtol=1e-6)
-
-
 def test_episodes_that_diverge_do_not_count(cart, monkeypatch):
     """A third of the carts begin nowhere, and in the end all of them do."""
     reset, odd = cart.reset, type(cart)()
@@ -228,18 +213,6 @@ def test_push_tells_its_expert_the_target_but_no_velocity_of_an_object(push):
     expected = places[1 - task.target] - places[task.target]
     changed = np.asarray(other - seen)
     np.testing.assert_allclose(changed[changed != 0][:2], expected, rtol=1e-4)
-
-
-def test_the_hand_of_push_travels_high_away_from_its_target(push):
-    """Up to 8 cm away it may be as low as it pushes, from 14.5 cm on it is to be 13 cm higher, between linearly."""
-    task = push.sample_task(jax.random.key(3), "train")
-    state = push.reset(jax.random.key(4), task)
-    tip = np.asarray(push.hand(state.qpos)[:3])
-    for away, height in ((0.05, 0.01), (0.08, 0.01), (0.1, 0.05), (0.145, 0.14), (0.4, 0.14)):
-        x = 7 + 3 * int(task.target)
-        moved = dataclasses.replace(state, qpos=state.qpos.at[x : x + 2].set(tip[:2] + away * np.array([0.6, 0.8])))
-        expected = 6 * min(tip[2] - height, 0)
-        np.testing.assert_allclose(push.manner(task, moved), [expected], atol=1e-4)
 
 
 def test_push_tells_its_expert_how_far_the_target_reaches(push):

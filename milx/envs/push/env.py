@@ -44,8 +44,6 @@ OBJECT_COST, TIP_COST, HEIGHT_COST, FINAL_COST = 1.0, 0.5, 2.0, 10.0
 """Weights of the residuals (1/m)."""
 PUSH_HEIGHT = 0.01
 """Height of the tip (m) at which the hand is to push."""
-CLOSE, TRAVEL_HEIGHT, TRAVEL_COST = 0.08, 0.13, 6.0
-"""Where the hand may be as low as it pushes, and how much higher it is to travel elsewhere (m); its weight (1/m)."""
 MISJUDGED = 0.015
 """Standard deviation of the error in where an expert that learns supposes the objects (m)."""
 _DIRECTIONS = np.stack([np.cos(np.arange(8) * np.pi / 4), np.sin(np.arange(8) * np.pi / 4)], axis=-1)
@@ -234,17 +232,6 @@ class Push(Env[PushTask]):
         timestep = jnp.asarray(self.substeps * self.mj_model.opt.timestep / _FEWER_STEPS, float)
         cheaper = model.opt.replace(iterations=2, ls_iterations=4, timestep=timestep)
         return self._advance(model.replace(opt=cheaper), state, action, _FEWER_STEPS)
-
-    def manner(self, task: PushTask, state: State) -> jax.Array:
-        """Returns [1], how far the tip is below the height at which it is to travel; weighted.
-
-        It is TRAVEL_COST min(z - h, 0), where h = PUSH_HEIGHT + clip(2 (d - CLOSE), 0, TRAVEL_HEIGHT), z is the height
-        of the tip, and d its distance from the target's center, seen from above (m).
-        """
-        place, tip = self.objects(state)[task.target, :2], self.hand(state.qpos)[:3]
-        away = jnp.sqrt(jnp.square(tip[:2] - place).sum() + 1e-8)
-        height = PUSH_HEIGHT + jnp.clip(2 * (away - CLOSE), 0.0, TRAVEL_HEIGHT)
-        return TRAVEL_COST * jnp.minimum(tip[2:] - height, 0.0)
 
     def misjudge(self, key: jax.Array, state: State) -> State:
         """Moves both objects by errors of a normal distribution in x and y."""
