@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from push_controller import let_control
 
 from milx import envs, methods
 from milx.config import assemble
@@ -78,7 +79,7 @@ def configure(env: str, method: str, preset: str, seed: int, steps: int | None) 
     A small set of demonstrations is to be small in colors and places, too. On vision reach eight time steps of the
     query and three layers learn faster than the three and two of `fast`, which end a little higher.
     """
-    config = make_config(env, method, preset, seed)
+    config = let_control(make_config(env, method, preset, seed))
     config.train.steps = steps or STEPS[env]
     config.train.eval_every = min(4000, config.train.steps)
     config.train.redraw = False

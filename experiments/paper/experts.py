@@ -14,12 +14,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from absl import app, flags
+from push_controller import TACTICS, Controlled, control
 
 import milx
 from milx.config.schema import DataConfig, EvalConfig
 from milx.core import files
 from milx.data import experts
-from milx.data.push_controller import TACTICS, Controlled, control
 from milx.data.simulated import collect
 from milx.envs.base import State
 from milx.envs.push.env import Push, PushTask

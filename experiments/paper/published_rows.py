@@ -2,9 +2,11 @@
 
 from typing import Any, NamedTuple
 
+from push_controller import let_control
+
 from milx.config import assemble
 from milx.config.assemble import make_config
-from milx.config.schema import Config
+from milx.config.schema import Config, DataConfig
 
 
 class Row(NamedTuple):
@@ -29,7 +31,7 @@ class Row(NamedTuple):
 
 def configure(row: Row, shots: int, seed: int) -> Config:
     """Configures a cell of a table."""
-    config = make_config(row.env, row.method, "paper", seed)
+    config = let_control(make_config(row.env, row.method, "paper", seed))
     config.evaluation.shots = shots
     for name, value in row.changes.items():
         assemble.assign(config, name, value)
@@ -143,6 +145,7 @@ _GRASP = {
     "grasp-contextual": Row("grasp, contextual", "grasp", _MUON, method="contextual"),
 }
 
+_LEARNED = {"data.expert": "pretrained", "data.plan_iterations": DataConfig.plan_iterations}
 _GOAL_HEAD = {"network.goal_head": True, "method.goal_weight": 1.0, "network.calibrate": False}
 _STEPS = {
     "reach": (
@@ -197,8 +200,13 @@ _STEPS = {
         ("calibrated", "votes from the camera's calibration", {"network.calibrate": True}),
         (
             "fast",
-            "30,000 updates, none without an inner step, clip 20: `fast`",
+            "30,000 updates, none without an inner step, clip 20",
             {"train.steps": 30_000, "method.inner_clip": 20.0} | _NO_IMITATION,
+        ),
+        (
+            "learned",
+            "an expert that has learned, goals after 20 time steps, more of the beginning: `fast`",
+            _LEARNED | {"env.goal_step": 20, "train.frame_exponent": 2.0},
         ),
     ),
 }
@@ -236,7 +244,6 @@ _SAMPLING = {
     "data.plan_batch": 512,
     "evaluation.baseline_trials": 1,
 }
-_PPO = _SAMPLING | {"data.expert": "ppo", "data.plan_iterations": 500, "data.plan_batch": 2048}
 _LADDER = _ladder()
 _SAMPLED = _LADDER["push-fast"].changes | _SAMPLING
 _MORE_TASKS = (
@@ -245,12 +252,13 @@ _MORE_TASKS = (
     | {"data.tasks": 2304, "data.demos_per_task": 4, "train.query_frames": 16, "train.steps": 20_000}
 )
 _EXPERTS = {
+    "push-two-heads-learned": Row("push, two heads, by an expert that has learned: `paper`", "push", _LEARNED),
     "push-sampling-beginning": Row(
-        "push: `fast`, by sampling, more of the beginning",
+        "push: the row before `fast`, by sampling, more of the beginning",
         "push",
         _SAMPLED | {"train.frame_exponent": 2.0},
     ),
-    "push-sampling": Row("push: `fast`, by sampling", "push", _SAMPLED),
+    "push-sampling": Row("push: the same without more of the beginning", "push", _SAMPLED),
     "push-sampling-tasks": Row(
         "push: the first row, but four demonstrations of 2,304 tasks, 16 query time steps, Muon, 20,000 updates",
         "push",
@@ -260,11 +268,6 @@ _EXPERTS = {
         "push: the second row, but with chunks of four actions, of which the mean is executed",
         "push",
         _MORE_TASKS | {"method.chunk": 4, "method.execute": 0},
-    ),
-    "push-ppo": Row(
-        "push: `fast`, by policy optimization, more of the beginning",
-        "push",
-        _LADDER["push-fast"].changes | _PPO | {"train.frame_exponent": 2.0},
     ),
 }
 

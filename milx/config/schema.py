@@ -59,8 +59,8 @@ class DataConfig:
         spare_demos: additional demonstrations of each validation and test task, so that failed ones can be replaced.
         expert: who demonstrates: "ilqr" plans; "sampling" plans whole episodes (`milx.trajopt.planner`), and "receding"
             the next time steps (`milx.trajopt.receding`), without derivatives; "ppo" is a network that first learns to
-            minimize the same cost (`milx.trajopt.learned`), and "pretrained" such a network that ships, for push;
-            "controller" knows how to push (`milx.data.push_controller`). `milx.data.experts.EXPERTS` has them by name.
+            minimize the same cost (`milx.trajopt.learned`), and "pretrained" such a network that ships, for push.
+            `milx.data.experts.EXPERTS` has them by name.
         plan_iterations: iterations of trajectory optimization for a demonstration: with "ilqr" their maximum number;
             with "sampling" their number, 8 in the results that are reported; with "receding" their number in each of
             many plans, for which 1 is enough; with "ppo" the number of batches of episodes that the network learns from

@@ -16,7 +16,6 @@ from rich.console import Console
 from milx.config.schema import DataConfig
 from milx.core import platform, progress, pytrees
 from milx.core.messages import warn
-from milx.data.push_controller import CONTROLLER, Controlled
 from milx.envs.base import Env
 from milx.trajopt import expert, learned, receding
 from milx.trajopt.demonstrations import find_plans, no_plans, share_plans
@@ -112,12 +111,6 @@ def _pretrained(env: Env, _: DataConfig) -> Expert:
     return Learned(LEARNED, _shipped(env))
 
 
-def _controlled(env: Env, _: DataConfig) -> Controlled:
-    if env.name != "push":
-        raise ValueError(f"data.expert: got 'controller', expected another one with {env.name}: it knows push only")
-    return CONTROLLER
-
-
 def digest(env: Env, *request: Any) -> str:
     """Hashes what was asked of an expert, and all versions that what it plans depends on."""
     versions = [jax.default_backend(), jax.__version__, mujoco.__version__, env.version, expert.VERSION]
@@ -177,6 +170,5 @@ EXPERTS: dict[str, Kind] = {
     "receding": Kind(_receding, lambda env, config: [config.plan_iterations, "receding", repr(RECEDING), env.ahead]),
     "ppo": Kind(_ppo, lambda _, config: [config.plan_iterations, "ppo", repr(LEARNED)]),
     "pretrained": Kind(_pretrained, lambda env, _: ["pretrained", pytrees.fingerprint(_shipped(env))], plans=False),
-    "controller": Kind(_controlled, lambda *run: ["controller", *_controlled(*run).tactics], plans=False),
 }
 """By name, as in `data.expert`. Another entry is another expert."""

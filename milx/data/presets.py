@@ -7,7 +7,13 @@ been compared with others there (docs/results/meta_world.md).
 from milx.config.registry import Overrides
 from milx.envs.push.presets import PUSH
 
-_FAST = PUSH["fast"] | {"train.steps": 10_000, "train.eval_every": 1000, "train.redraw": False}
+_FAST = PUSH["fast"] | {
+    "env.goal_step": None,
+    "train.steps": 10_000,
+    "train.eval_every": 1000,
+    "train.frame_exponent": 1.0,
+    "train.redraw": False,
+}
 _METAWORLD = {
     "network.kernel": 3,
     "optimizer.learning_rate": 1e-3,

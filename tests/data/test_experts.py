@@ -42,10 +42,6 @@ def env():
             {"expert": "pretrained"},
             "data.expert: got 'pretrained', expected another one with place: experts ship for push only",
         ),
-        (
-            {"expert": "controller"},
-            "data.expert: got 'controller', expected another one with place: it knows push only",
-        ),
     ],
 )
 def test_what_no_expert_understands_is_refused(env, changes, message):
@@ -161,17 +157,14 @@ def test_an_expert_learns_once_and_is_kept(env, tmp_path, monkeypatch, capsys):
     experts._actor.cache_clear()
 
 
-def test_all_that_decides_describes_experts_that_need_no_iterations(monkeypatch):
-    push = milx.make("push", (8, 8))
-    described = [experts.description(push, DataConfig(expert=name)) for name in ("pretrained", "controller")]
+def test_an_expert_that_ships_is_described_by_what_it_learned(monkeypatch):
+    push, config = milx.make("push", (8, 8)), DataConfig(expert="pretrained")
+    described = [experts.description(push, dataclasses.replace(config, noise=noise)) for noise in (0.1, 0.3)]
+    assert experts.description(push, dataclasses.replace(config, noise=0.3, plan_iterations=3)) == described[1]
     others = jax.tree.map(lambda x: x + 1, experts._shipped(push))
     monkeypatch.setattr(experts, "_shipped", lambda env: others)
-    monkeypatch.setattr(experts, "CONTROLLER", experts.CONTROLLER._replace(tactics=(0.0, 0.01)))
-    described += [experts.description(push, DataConfig(expert=name)) for name in ("pretrained", "controller")]
-    described.append(experts.description(push, DataConfig(expert="controller", noise=0.3)))
+    described.append(experts.description(push, dataclasses.replace(config, noise=0.3)))
     assert all(one != other for i, one in enumerate(described) for other in described[:i])
-    again = experts.description(push, DataConfig(expert="controller", noise=0.3, plan_iterations=3))
-    assert again == described[-1]
 
 
 @pytest.mark.slow

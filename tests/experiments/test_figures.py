@@ -115,10 +115,11 @@ def test_the_ladder_ends_with_fast(env):
     assert config == make_config(env, preset="fast", seed=0)
 
 
-def test_demonstrations_by_sampling_and_goals_are_all_that_their_row_changes_of_fast():
-    row = published_rows.TABLES["experts"]["push-sampling"]
-    config = dataclasses.replace(published_rows.configure(row, 1, seed=0), preset="fast")
-    fast = make_config("push", preset="fast", seed=0)
+def test_demonstrations_by_sampling_and_goals_are_all_that_their_row_changes():
+    config, fast = (
+        published_rows.configure(published_rows.TABLES[table][name], 1, seed=0)
+        for table, name in (("experts", "push-sampling"), ("ladder", "push-fast"))
+    )
     evaluation = dataclasses.replace(fast.evaluation, baseline_trials=1)
     assert config == dataclasses.replace(fast, env=config.env, data=config.data, evaluation=evaluation)
     assert config.env == dataclasses.replace(fast.env, goal_step=20)

@@ -9,8 +9,7 @@ _WORLD: Overrides = {
     "data.demos_per_task": 12,
     "data.noise": 0.1,
     "data.spare_demos": 2,
-    "data.expert": "controller",
-    "data.plan_iterations": 0,
+    "data.expert": "pretrained",
     "evaluation.tasks": 740,
     "evaluation.trials": 6,
     "evaluation.baseline_trials": 6,
@@ -43,6 +42,7 @@ _FAST = (
     | GOAL_HEAD
     | _WORLD
     | {
+        "env.goal_step": 20,
         "network.filters": (32, 32, 32, 32),
         "network.strides": (2, 2, 2, 1),
         "network.kernel": 5,
@@ -54,6 +54,7 @@ _FAST = (
         "train.meta_batch": 32,
         "train.support_frames": 4,
         "train.query_frames": 8,
+        "train.frame_exponent": 2.0,
         "train.redraw": True,
     }
 )
@@ -71,7 +72,6 @@ _CPU = _FAST | {
     "optimizer.learning_rate": 1.5e-3,
     "train.steps": 5000,
     "train.meta_batch": 8,
-    "train.frame_exponent": 2.0,
     "train.log_every": 25,
     "train.eval_every": 2500,
     "evaluation.validation_tasks": 25,

@@ -1,4 +1,4 @@
-"""A controller that pushes an object to the goal, as an expert that rehearses.
+"""A controller that pushes an object to the goal, as an expert that rehearses (`data.expert=controller`).
 
 It knows the task. Each time step it looks where the hand is and decides anew: rise and travel behind the object, seen
 from the goal, come down, and push towards the goal. The hand's velocity becomes joint velocities by damped least
@@ -14,9 +14,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from milx.config.schema import Config
 from milx.core import parallel
 from milx.core.batching import map_in_chunks
 from milx.core.linear_algebra import solve_free
+from milx.data import experts
 from milx.envs.base import Env, State, Task
 from milx.envs.push.env import NUM_JOINTS, Push, PushTask
 from milx.trajopt.episode import judge
@@ -167,3 +169,21 @@ def _perform(env: Env, control: Callable, noise: float, *batch: Any) -> tuple[St
 
 CONTROLLER = Controlled(control, TACTICS)
 """Push's."""
+
+
+def _for_push(env: Env, _: Any) -> Controlled:
+    if env.name != "push":
+        raise ValueError(f"data.expert: got 'controller', expected another one with {env.name}: it knows push only")
+    return CONTROLLER
+
+
+experts.EXPERTS["controller"] = experts.Kind(
+    _for_push, lambda *run: ["controller", *_for_push(*run).tactics], plans=False
+)
+
+
+def let_control(config: Config) -> Config:
+    """Lets the controller demonstrate, if it is about push, as in all results from before an expert had learned it."""
+    if config.env_name == "push":
+        config.data.expert, config.data.plan_iterations = "controller", 0
+    return config
