@@ -28,6 +28,7 @@ def env():
     ("changes", "message"),
     [
         ({"expert": "mppi"}, "data.expert: got 'mppi', expected one of ilqr, sampling, receding, ppo"),
+        ({"expert": "controller"}, "pretrained; 'pretrained' takes its place in push, in config.json, too"),
         (
             {"expert": "sampling", "plan_iterations": 0},
             "data.plan_iterations: got 0, expected at least 1 with sampling",
