@@ -254,11 +254,11 @@ _MORE_TASKS = (
 _EXPERTS = {
     "push-two-heads-learned": Row("push, two heads, by an expert that has learned: `paper`", "push", _LEARNED),
     "push-sampling-beginning": Row(
-        "push: the row before `fast`, by sampling, more of the beginning",
+        "push: `fast`, by sampling",
         "push",
         _SAMPLED | {"train.frame_exponent": 2.0},
     ),
-    "push-sampling": Row("push: the same without more of the beginning", "push", _SAMPLED),
+    "push-sampling": Row("push: the first row without more of the beginning", "push", _SAMPLED),
     "push-sampling-tasks": Row(
         "push: the first row, but four demonstrations of 2,304 tasks, 16 query time steps, Muon, 20,000 updates",
         "push",

@@ -183,7 +183,8 @@ experts.EXPERTS["controller"] = experts.Kind(
 
 
 def let_control(config: Config) -> Config:
-    """Lets the controller demonstrate, if it is about push, as in all results from before an expert had learned it."""
+    """Lets the controller demonstrate push, and undoes what `fast` has for the demonstrations of the one that ships."""
     if config.env_name == "push":
-        config.data.expert, config.data.plan_iterations = "controller", 0
+        config.data.expert, config.data.plan_iterations, config.env.goal_step = "controller", 0, None
+        config.train.frame_exponent = 2.0 if config.preset == "cpu" else 1.0
     return config

@@ -29,34 +29,42 @@ import milx
 from milx import envs
 from milx.config.assemble import make_config
 from milx.config.schema import PHYSICS, DataConfig
-from milx.core import files
+from milx.core import files, pytrees
 from milx.data import experts
 from milx.data.simulated import collect
 from milx.envs.base import Env
 from milx.evaluation import provenance
 from milx.evaluation.intervals import wilson_interval
-from milx.trajopt.expert import Sampling
+from milx.trajopt.expert import Learned, Sampling
 
 FIRST_SEED = 1000
 """Of the scenes; push.py and the trials by which settings were chosen have smaller ones."""
 ITERATIONS = {"sampling": 8, "receding": 1, "ppo": 500, "pretrained": 1}
-SETTINGS = {"sampling": experts.SETTINGS, "receding": experts.RECEDING, "ppo": experts.LEARNED}
+SETTINGS = {
+    "sampling": experts.SETTINGS,
+    "receding": experts.RECEDING,
+    "ppo": experts.LEARNED,
+    "pretrained": experts.LEARNED,
+}
 
 
 def measure(env: Env, config: DataConfig, scenes: int) -> Iterator[dict[str, Any]]:
     """Plans and executes `scenes` scenes, rounded up to whole batches, and yields what is known after each batch."""
     began, batch = time.perf_counter(), config.plan_batch
     expert = experts.expert_of(env, config)
-    plans, counts = {}, []
+    known: dict[str, Any] = {}
+    counts: list[int] = []
     if isinstance(expert, Sampling):
-        plans = {"plans_to_begin_with": int(expert.plans.success.sum())}
+        known = {"plans_to_begin_with": int(expert.plans.success.sum())}
+    if isinstance(expert, Learned):
+        known = {"actor": pytrees.fingerprint(expert.actor)}
     seconds = {"before the first demonstration, with compilation": time.perf_counter() - began}
     for number in range(-(-scenes // batch)):
         demos = collect(env, jax.random.key(FIRST_SEED + number), "train", batch, 1, config)
         counts.append(int(demos.success.sum()))
         made, total = batch * len(counts), time.perf_counter() - began
         yield {
-            **plans,
+            **known,
             "scenes": made,
             "success": sum(counts) / made,
             "wilson95": wilson_interval(sum(counts), made),
@@ -82,11 +90,8 @@ def main(_: list[str]) -> None:
         config = dataclasses.replace(config, **changes)
         env, settings = envs.make(name, (16, 16)), {"first_seed": FIRST_SEED, "physics": _PHYSICS.value}
         env = env.by_warp() if _PHYSICS.value == "warp" else env
-        if expert == "pretrained":
-            settings["actor"] = experts.description(env, config)[-1]
-        else:
-            of_expert: Any = SETTINGS[expert]
-            settings |= dataclasses.asdict(of_expert) | ({"ahead": env.ahead} if expert == "receding" else {})
+        of_expert: Any = SETTINGS[expert]
+        settings |= dataclasses.asdict(of_expert) | ({"ahead": env.ahead} if expert == "receding" else {})
         for found in measure(env, config, _SCENES.value):
             said = {"env": name, "data": dataclasses.asdict(config), "settings": settings}
             result = {**said, **found, **origin}

@@ -2,7 +2,8 @@
 
 Version 1 had no version number. All methods shared one class of network settings and one group "mil", so a
 configuration also held fields that its method did not use. In version 2, `lstm_attention` still had the settings of
-convolutions and of a goal head. In version 3, no iterations of iLQR meant the controller of push.
+convolutions and of a goal head. In version 3, no iterations of iLQR meant the controller of push,
+which is in `experiments/paper` now.
 """
 
 from typing import Any

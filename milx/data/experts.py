@@ -77,7 +77,8 @@ class Kind(NamedTuple):
 def _kind(config: DataConfig) -> Kind:
     """Looks up who is to demonstrate."""
     if config.expert not in EXPERTS:
-        instead = "; 'pretrained' takes its place in push, in config.json, too" if config.expert == "controller" else ""
+        instead = "; push has 'pretrained' now, with which an earlier run can be evaluated, but not go on"
+        instead = instead if config.expert == "controller" else ""
         raise ValueError(f"data.expert: got {config.expert!r}, expected one of {', '.join(EXPERTS)}{instead}")
     kind = EXPERTS[config.expert]
     if kind.plans and config.plan_iterations < 1:

@@ -30,6 +30,7 @@ from milx.config.schema import Config, ConvConfig
 from milx.core import files, parallel, progress, signals
 from milx.core.checkpoint import UNVALIDATED, Checkpoints
 from milx.core.messages import printable, say
+from milx.data import RECORDED
 from milx.evaluation import listening, results
 from milx.methods import params_like
 from milx.networks import fixed_filters
@@ -274,6 +275,8 @@ class Run(abc.ABC):
             theirs["train"]["steps"] = mine["train"]["steps"]
         theirs["evaluation"] |= {name: mine["evaluation"][name] for name in _ANYWHERE}
         theirs["train"]["wandb"] = mine["train"]["wandb"]
+        if self.config.env_name == RECORDED:
+            theirs |= {group: mine[group] for group in ("env", "data")}  # which nothing reads
         if changed := assemble.differences(theirs, mine):
             raise ValueError(f"workdir: {self.folder} holds another run: {'; '.join(changed)}")
         if extend and assemble.flatten(mine) != before:

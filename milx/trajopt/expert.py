@@ -22,7 +22,7 @@ from milx.trajopt.ilqr import Options, Plan, solve
 from milx.trajopt.planner import Plans, Settings
 
 VERSION = 4
-"""Of all that plans, learns and demonstrates, the controller of push included: raised when it does so differently with
+"""Of all that plans, learns and demonstrates, also outside milx: raised when it does so differently with
 the same settings, so that no demonstration planned before it is taken for one planned after it."""
 
 

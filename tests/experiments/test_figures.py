@@ -1,6 +1,7 @@
 """What figures and tables make of result files."""
 
 import dataclasses
+import json
 import pathlib
 import re
 import sys
@@ -20,6 +21,7 @@ import table3
 import tables
 
 from milx import envs, methods
+from milx.config import assemble
 from milx.config.assemble import make_config
 from milx.training import state
 
@@ -115,14 +117,11 @@ def test_the_ladder_ends_with_fast(env):
     assert config == make_config(env, preset="fast", seed=0)
 
 
-def test_demonstrations_by_sampling_and_goals_are_all_that_their_row_changes():
-    config, fast = (
-        published_rows.configure(published_rows.TABLES[table][name], 1, seed=0)
-        for table, name in (("experts", "push-sampling"), ("ladder", "push-fast"))
-    )
+def test_demonstrations_by_sampling_are_all_that_their_row_changes():
+    row, fast = published_rows.TABLES["experts"]["push-sampling-beginning"], make_config("push", preset="fast")
+    config = dataclasses.replace(published_rows.configure(row, 1, seed=0), preset="fast")
     evaluation = dataclasses.replace(fast.evaluation, baseline_trials=1)
-    assert config == dataclasses.replace(fast, env=config.env, data=config.data, evaluation=evaluation)
-    assert config.env == dataclasses.replace(fast.env, goal_step=20)
+    assert config == dataclasses.replace(fast, data=config.data, evaluation=evaluation)
     planned = {"expert": "sampling", "plan_iterations": 8, "plan_batch": 512}
     assert config.data == dataclasses.replace(fast.data, **planned)
 
@@ -140,6 +139,22 @@ def test_intervals_of_one_table_are_of_one_kind():
     over_things = result(500, 0.8, 0.7, 0.85) | {"bootstrap95": [0.6, 0.9]}
     assert tables.interval([over_things, over_things]) == "80.0% (60.0% to 90.0%; 2)"
     assert tables.interval([over_things, result(500, 0.6, 0.5, 0.7)]) == "70.0% (50.0% to 85.0%; 2)"
+
+
+def test_push_is_configured_as_when_its_controller_demonstrated():
+    """In what its presets have for the demonstrations of another expert since then."""
+
+    def of_expert(config):
+        return config.data.expert, config.data.plan_iterations, config.env.goal_step, config.train.frame_exponent
+
+    root = pathlib.Path(__file__).parents[2] / "experiments" / "results"
+    paths = [path for folder in ("table1", "figure3_push", "tuning") for path in (root / folder).glob("*.json")]
+    found = [assemble.from_dict(json.loads(path.read_text())["config"]) for path in paths]
+    found = [config for config in found if config.env_name == "push"]
+    assert len(found) == 67
+    for config in found:
+        now = cells.configure("push", config.method_name, config.preset, config.seed, config.train.steps)
+        assert of_expert(now) == of_expert(config)
 
 
 def test_results_of_the_published_method_are_of_their_rows():

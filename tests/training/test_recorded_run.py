@@ -117,6 +117,16 @@ def test_a_run_can_be_extended_and_not_shortened(finished, folder, tmp_path):
     assert Checkpoints(copy / "checkpoints", read_only=True).latest == 400
 
 
+def test_a_run_goes_on_where_only_what_it_does_not_read_has_changed(finished, folder):
+    """Presets may change simulated worlds and their experts, which say nothing of recorded demonstrations."""
+    config = tiny_config(folder)
+    config.data.expert, config.data.plan_iterations, config.env.goal_step = "controller", 0, 7
+    make_run(config, finished[0].folder, QUIET)
+    config.method.inner_lr /= 2
+    with pytest.raises(ValueError, match=r"holds another run: method.inner_lr was 0.03, now 0.015$"):
+        make_run(config, finished[0].folder, QUIET)
+
+
 def test_errors_are_those_of_a_loop_over_demonstrations(finished, folder):
     """Compares what the run reports with what the policy that users load does, step by step."""
     run, result = finished
