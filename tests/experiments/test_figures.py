@@ -117,6 +117,11 @@ def test_the_ladder_ends_with_fast(env):
     assert config == make_config(env, preset="fast", seed=0)
 
 
+def test_two_heads_by_an_expert_that_has_learned_are_the_preset_paper():
+    row = published_rows.TABLES["experts"]["push-two-heads-learned"]
+    assert published_rows.configure(row, 1, seed=0) == make_config("push", preset="paper", seed=0)
+
+
 def test_demonstrations_by_sampling_are_all_that_their_row_changes():
     row, fast = published_rows.TABLES["experts"]["push-sampling-beginning"], make_config("push", preset="fast")
     config = dataclasses.replace(published_rows.configure(row, 1, seed=0), preset="fast")
