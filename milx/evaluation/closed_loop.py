@@ -273,20 +273,25 @@ def _expert_inputs(
     return tasks, scenes, keys, as_it_is
 
 
-@functools.partial(jax.jit, static_argnums=0)
+@functools.cache
+def _filming(camera: Env) -> Any:
+    """Makes the program of `film`."""
+    return jax.jit(jax.vmap(camera.film), compiler_options=platform.pixel_options())
+
+
 def film(camera: Env, task: Task, states: State) -> jax.Array:
     """Draws images [N, F, H, W, 3] uint8 of episodes of N tasks: `states` has leading axes [N, T + 1].
 
     `camera` is the environment with the wanted image size.
     """
-    return jax.vmap(camera.film)(task, states)
+    return _filming(camera)(task, states)
 
 
 def precompile_film(camera: Env, num_tasks: int) -> None:
     """Compiles what `film` runs for so many tasks, into the compilation cache."""
     demos = shapes(camera, num_tasks, 1)
     states = jax.tree.map(lambda x: jax.ShapeDtypeStruct((num_tasks, *x.shape[2:]), x.dtype), demos.states)
-    film.lower(camera, *parallel.replicated_shapes((demos.task, states))).compile()
+    _filming(camera).lower(*parallel.replicated_shapes((demos.task, states))).compile()
 
 
 def summarize(

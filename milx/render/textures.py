@@ -6,6 +6,7 @@ out is a family, not another size of one that was trained on.
 """
 
 import functools
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -17,7 +18,9 @@ from milx.render.raycast import Vector, dot
 
 PERIOD = (0.015, 0.045)
 """Of a texture (m), drawn uniformly."""
-_TURN = 2 * jnp.pi
+_TURN = 2 * math.pi
+# Coefficients of sin(2 pi x) in powers of x, from the ninth to the first.
+_SINE = tuple((-1) ** (k // 2) * _TURN**k / math.factorial(k) for k in (9, 7, 5, 3, 1))
 # Directions and phases of the waves that add up to noise.
 _WAVES = ((0.9, 0.4, 0.2, 0.0), (-0.5, 0.8, 0.5, 1.3), (0.3, -0.7, 0.9, 2.9), (1.4, 1.1, -0.8, 4.4))
 
@@ -37,14 +40,22 @@ class Textures(NamedTuple):
     frame: jax.Array
 
 
-def _wave(x: jax.Array) -> jax.Array:
-    """Evaluates a wave of period 1 between -1 and 1."""
-    return jnp.sin(_TURN * x)
-
-
 def _saw(x: jax.Array) -> jax.Array:
     """Computes the signed distance from the nearest whole number, of period 1."""
     return x - jnp.floor(x + 0.5)
+
+
+def _wave(x: jax.Array) -> jax.Array:
+    """Evaluates sin(2 pi x) by its Taylor series in the quarter of a period around 0, to 4e-6.
+
+    On CPUs XLA's own sine takes ten times as long, and textures most of the time of an image.
+    """
+    near = 0.25 - jnp.abs(_saw(x - 0.25))  # sin(2 pi x) = sin(2 pi near), and near is in [-1/4, 1/4]
+    square = near * near
+    total = jnp.zeros_like(x)
+    for coefficient in _SINE:
+        total = total * square + coefficient
+    return total * near
 
 
 def _edge(x: jax.Array, sharpness: float) -> jax.Array:
@@ -56,7 +67,7 @@ def _noise(p: Vector) -> jax.Array:
     """Sums waves in directions without a common period, each bent by the one before."""
     total = bend = jnp.zeros_like(p[0])
     for x, y, z, phase in _WAVES:
-        bend = jnp.sin(4 * (x * p[0] + y * p[1] + z * p[2]) + phase + 1.5 * bend)
+        bend = _wave((4 * (x * p[0] + y * p[1] + z * p[2]) + phase + 1.5 * bend) / _TURN)
         total = total + bend / len(_WAVES)
     return total
 

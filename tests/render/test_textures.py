@@ -42,6 +42,14 @@ def test_regular_families_repeat(name):
     assert np.quantile(off, 0.99) < 1e-3
 
 
+def test_stripes_follow_the_sine():
+    x = jnp.linspace(-4.0, 4.0, 4001)
+    shown = textures.FAMILIES["stripes"]((x, jnp.zeros_like(x), jnp.zeros_like(x)))
+    expected = np.clip(0.5 + 4 * np.sin(2 * np.pi * np.asarray(x, float)), 0, 1)
+    # Four times the error of a series that ends with the ninth power, (pi / 2)^11 / 11! = 4e-6, and of rounding x.
+    np.testing.assert_allclose(shown, expected, atol=3e-5)
+
+
 @pytest.mark.parametrize("name", NAMES[1:])
 def test_both_colors_show_on_a_thing(name):
     """Covers a ball as large as a small object, in the largest period."""
