@@ -252,7 +252,6 @@ _MORE_TASKS = (
     | {"data.tasks": 2304, "data.demos_per_task": 4, "train.query_frames": 16, "train.steps": 20_000}
 )
 _EXPERTS = {
-    "push-two-heads-learned": Row("push, two heads, by an expert that has learned: `paper`", "push", _LEARNED),
     "push-sampling-beginning": Row(
         "push: `fast`, by sampling",
         "push",
@@ -269,6 +268,7 @@ _EXPERTS = {
         "push",
         _MORE_TASKS | {"method.chunk": 4, "method.execute": 0},
     ),
+    "push-two-heads-learned": Row("push, two heads, by an expert that has learned: `paper`", "push", _LEARNED),
 }
 
 TABLES: dict[str, dict[str, Row]] = {
