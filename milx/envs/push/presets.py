@@ -85,5 +85,5 @@ PUSH: dict[str, Overrides] = {"paper": _PAPER, "fast": _FAST, "cpu": _CPU}
 PUSH_DURATIONS = {
     "paper": "7 minutes on an H200",
     "fast": "6 minutes on an H200",
-    "cpu": "19 minutes on two CPU cores",
+    "cpu": "20 minutes on two CPU cores",
 }
