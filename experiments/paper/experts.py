@@ -33,7 +33,7 @@ experts.EXPERTS["one-tactic"] = experts.Kind(
     lambda *_: Controlled(control, TACTICS[:1]), lambda *_: ["one-tactic"], plans=False
 )
 NOISE = (0.0, 0.1)
-"""Standard deviation on the actions; the presets' is the last."""
+"""Standard deviation on the actions; the last is that of `paper` and `fast`."""
 _EXPERTS = flags.DEFINE_multi_enum("experts", list(EXPERTS), list(EXPERTS), "Which (repeat the flag).")
 _OUT = flags.DEFINE_string("out", "experiments/results/experts", "Folder of the JSON files.")
 _SCENES = flags.DEFINE_integer("scenes", 512, "Scenes of each split, each of another task.", lower_bound=1)

@@ -31,7 +31,7 @@ from milx.trajopt.planner import Planner, Plans, Settings
 from milx.trajopt.sampling import Options, Search
 
 NOISE = 0.1
-"""Standard deviation on the actions; the presets'."""
+"""Standard deviation on the actions; that of `paper` and `fast`."""
 _CEM = functools.partial(Options, "cross_entropy", deviation_min=0.03)
 ROWS = {
     "cem-32": _CEM(samples=32, elites=6, order=3),

@@ -46,9 +46,10 @@ def _saw(x: jax.Array) -> jax.Array:
 
 
 def _wave(x: jax.Array) -> jax.Array:
-    """Evaluates sin(2 pi x) by its Taylor series in the quarter of a period around 0, to 4e-6.
+    """Evaluates sin(2 pi x) by its Taylor series of the ninth order within a quarter of a period of 0, to 4e-6.
 
-    On CPUs XLA's own sine takes ten times as long, and textures most of the time of an image.
+    What rounding x - 1/4 costs is added to that, 2e-5 where x is 100. On CPUs XLA's own sine takes ten times as long:
+    with it textures took most of the time of an image.
     """
     near = 0.25 - jnp.abs(_saw(x - 0.25))  # sin(2 pi x) = sin(2 pi near), and near is in [-1/4, 1/4]
     square = near * near

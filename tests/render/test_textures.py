@@ -42,12 +42,13 @@ def test_regular_families_repeat(name):
     assert np.quantile(off, 0.99) < 1e-3
 
 
-def test_stripes_follow_the_sine():
-    x = jnp.linspace(-4.0, 4.0, 4001)
-    shown = textures.FAMILIES["stripes"]((x, jnp.zeros_like(x), jnp.zeros_like(x)))
-    expected = np.clip(0.5 + 4 * np.sin(2 * np.pi * np.asarray(x, float)), 0, 1)
-    # Four times the error of a series that ends with the ninth power, (pi / 2)^11 / 11! = 4e-6, and of rounding x.
-    np.testing.assert_allclose(shown, expected, atol=3e-5)
+def test_waves_are_those_of_the_sine():
+    """Of checks with these other coordinates a whole wave shows: 0.5 + 0.5 sin(2 pi x)."""
+    x = np.linspace(-4, 4, 4001, dtype=np.float32)
+    other = np.full_like(x, 0.25), np.full_like(x, np.arcsin(1 / 16) / (2 * np.pi))
+    shown = textures.FAMILIES["checks"](tuple(jnp.asarray(p) for p in (x, *other)))
+    # A series that ends with the ninth power is off by up to (pi / 2)^11 / 11! = 4e-6, and half of it shows.
+    np.testing.assert_allclose(shown, 0.5 + 0.5 * np.sin(2 * np.pi * x.astype(float)), atol=6e-6)
 
 
 @pytest.mark.parametrize("name", NAMES[1:])
