@@ -186,8 +186,9 @@ def let_control(config: Config) -> Config:
     """Lets the controller demonstrate push, and restores what the presets had for its demonstrations."""
     if config.env_name == "push":
         config.data.expert, config.data.plan_iterations, config.env.goal_step = "controller", 0, None
-        config.train.frame_exponent = 2.0 if config.preset == "cpu" else 1.0
         if config.preset == "cpu":
             config.data.tasks, config.data.demos_per_task, config.data.noise = 200, 6, 0.1
             config.train.steps, config.train.eval_every = 5000, 2500
+        else:
+            config.train.frame_exponent = 1.0
     return config
