@@ -1,4 +1,7 @@
-"""Puts a run's policy among those that ship with milx: python experiments/paper/ship.py runs/push-mil-fast-0 push."""
+"""Puts a run's policy among those that ship with milx: python experiments/paper/ship.py runs/push-mil-fast-0 push.
+
+Its test then prints the actions that belong into tests/fixtures/actions.json.
+"""
 
 import json
 import pathlib

@@ -227,7 +227,10 @@ class World(abc.ABC, Generic[TaskT]):
         return self._draw(self.model_of(task), task, state)
 
     def film(self, task: TaskT, states: State) -> jax.Array:
-        """Draws images [F, H, W, 3] uint8 of an episode and its outcome; `states` has a leading axis T + 1."""
+        """Draws images [F, H, W, 3] uint8 of an episode and its outcome; `states` has a leading axis T + 1.
+
+        It is compiled for pixels (`platform.pixel_options`), so it must not step a model with a long chain.
+        """
         return jax.vmap(self.render, in_axes=(None, 0))(task, states)
 
     def _draw(self, model: mjx.Model, task: TaskT, state: State) -> jax.Array:
